@@ -95,6 +95,8 @@ class Limiter:
         self._block = np.concatenate([numbers, *bounds, np.zeros(4 * n + 6)])
         self._q, self._nominal, self._reached, self._delta, self._offset = _state_views(self._block)
         self._out = _read_only(self._q), _read_only(self._offset)
+        self._state = self._block[SCALARS + 3 * n :]
+        self._kept = self._state.copy()
         self._q[:] = self._nominal[:] = np.nan
 
     @property
@@ -147,6 +149,14 @@ class Limiter:
     def lag(self) -> float:
         """Return how far the last command is from its goal, rad: the velocity limited it."""
         return float(np.abs(self._nominal + self._delta - self._q).max())
+
+    def keep(self) -> None:
+        """Remember the present state for ``take_back``."""
+        self._kept[:] = self._state
+
+    def take_back(self) -> None:
+        """Return to the state of the last ``keep``: what was limited since is not in force."""
+        self._state[:] = self._kept
 
     def reset(self) -> None:
         """End the stream; ``limit`` refuses until ``start``."""

@@ -21,7 +21,14 @@ from gapbridge.drivers.controller_facts import ControllerFacts, Difference, diff
 from gapbridge.drivers.gate import Gate
 from gapbridge.drivers.state_check import FASTEST, SampleCheck
 
-GATED = ("read_state", "write_setpoint", "arm", "release", "abandon")  # not to be overridden
+GATED = (
+    "read_state",
+    "write_setpoint",
+    "take_lapsed",
+    "arm",
+    "release",
+    "abandon",
+)  # not to be overridden
 
 
 class Driver(ABC):
@@ -114,6 +121,21 @@ class Driver(ABC):
     @abstractmethod
     def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint that has passed the gate; see ``write_setpoint``."""
+
+    @final
+    def take_lapsed(self) -> bool:
+        """Return, once, whether the setpoint sent last never took effect: it had become too old.
+
+        The one before it is in force; the stream must go on from that.
+        """
+        lapsed = self._take_lapsed()
+        if lapsed:
+            self.gate.take_back()
+        return lapsed
+
+    def _take_lapsed(self) -> bool:
+        """Implement ``take_lapsed``; only a driver whose setpoints wait for a message has any."""
+        return False
 
     @abstractmethod
     def close(self) -> None:

@@ -208,6 +208,7 @@ class Gate:
         self._open = False
         self._budget = self._at = self._travel = 0.0  # s
         self._clock = clock
+        self._before = self._state()
         self.bounds = GateBounds()
         self.set_bounds(self.bounds)
         self._judged(0.0)  # compiles the kernel: the first setpoint must not wait for it
@@ -274,8 +275,16 @@ class Gate:
             raise GateError(self._reason(FAR_START, int(np.argmax(away)), float(away.max())))
         self._joints[2] = start_q
 
+    def _state(self) -> tuple[Array, Array, tuple[Array, Array] | None]:
+        return self._joints[2].copy(), self._offsets[1].copy(), self._started
+
+    def take_back(self) -> None:
+        """Judge from the setpoint before the one sent last, which never took effect."""
+        self._joints[2], self._offsets[1], self._started = self._before
+
     def sent(self) -> None:
         """Record that the setpoint checked last was sent."""
+        self._before = self._state()
         now = self._clock()
         self._budget = min(self._budget + CLOCK_RATIO * max(now - self._at, 0.0), self._most)
         self._budget, self._at, self._travel = self._budget - self._travel, now, 0.0

@@ -90,6 +90,8 @@ class Run:
                     self.not_started.append(self.process)
                     self.start_anew(RETRY, arms)
                 raise
+            finally:
+                self.on_death()
 
         self.process = Process(self.world, f"daemon {len(self.daemons)}", run)
         self._record(daemon, self.process)

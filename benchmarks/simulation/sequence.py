@@ -231,7 +231,7 @@ class Person(Process):
         if process.dead or process.over:
             return {"ok": False, "error": "found no daemon"}
         request = Process(self.world, "request", ask)
-        while not request.over and not process.dead:
+        while not (request.over or process.dead or process.over):  # its threads end with it
             self.sleep(RECOVERY)
         if not answers:
             request.kill()

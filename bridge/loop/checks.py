@@ -34,7 +34,7 @@ GAPS = 5  # between states, before the controller's rate counts as known
 GAPS_KEPT = 50  # gaps between states that are remembered
 RATE_TOLERANCE = 1.5  # cycles of the cell: bound of the shortest gap between states
 # bits of a cycle's flags
-DEGRADED, LATE, RESYNC, RAMPING_OUT, UNSOLVED, NOTHING = 1, 2, 4, 8, 16, 32
+DEGRADED, LATE, RESYNC, RAMPING_OUT, UNSOLVED, NOTHING, TOOK_BACK = 1, 2, 4, 8, 16, 32, 64
 
 
 class FrozenWatch:

@@ -19,7 +19,14 @@ from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory, write_cycle
-from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED, LoopChecks
+from gapbridge.bridge.loop.checks import (
+    NOTHING,
+    RAMPING_OUT,
+    RESYNC,
+    TOOK_BACK,
+    UNSOLVED,
+    LoopChecks,
+)
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor, hold_time
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
@@ -302,6 +309,8 @@ class Loop:
             self._check_writing()
         if writes and writing.ramps_out:
             flags |= RAMPING_OUT
+        if writes and writing.took_back:
+            flags |= TOOK_BACK
         setpoint = writing.unsent if writes and written is None else written
         cycle_input = CycleInput(state, missed, nominal_q, loads, flags)
         self._record(cycle_input, setpoint, writes, written is not None)

@@ -54,6 +54,7 @@ class OffsetInForce:
         numbers = np.frombuffer(self._memory, np.float64)
         self._which = numbers[:1]  # 0: none; 1, 2: the valid record
         self._places = numbers[1:].reshape(2, size)
+        self._before = float(self._which[0])
 
     @classmethod
     def of_link(cls, n: int, link: DriverSettings) -> Self:
@@ -66,7 +67,12 @@ class OffsetInForce:
         place = 0 if self._which[0] == 2.0 else 1
         row, n = self._places[place], self._n
         row[:n], row[n : 2 * n], row[2 * n :] = q, delta, offset_in_base
+        self._before = float(self._which[0])
         self._which[0] = place + 1.0
+
+    def take_back(self) -> None:
+        """Return to what was stored before the last ``note``: it never took effect."""
+        self._which[0] = self._before
 
     def offset_at(self, q: Array) -> InForce | None:
         """Return the offset that an arm at q (n,) rad still has; None: none, or it was moved."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_state import State
-from gapbridge.bridge.loop.checks import RAMPING_OUT, RESYNC
+from gapbridge.bridge.loop.checks import RAMPING_OUT, RESYNC, TOOK_BACK
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.loop import UNSENT, CycleInput, Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import InForce, OffsetInForce
@@ -41,6 +41,7 @@ class ReplayedLoop(Loop):
         self._model, self._recording = model, driver
         self._process: int | None = None  # number of the recorded loop process
         self._streaming = False  # between the first setpoint of a stream and its last
+        self._sent = False  # the last setpoint computed was
 
     def _open_offset_in_force(self) -> OffsetInForce:
         """Keep it in memory only: a recording moves no arm."""
@@ -113,12 +114,15 @@ class ReplayedLoop(Loop):
                 stream.start(cycle.own_q, state.timestamp, led=True, in_force=in_force)
                 self._recording.arm(state)
                 self._streaming = True
+            elif cycle.flags & TOOK_BACK:
+                self._take_back()
             if not cycle.written and cycle.attempted != UNSENT:
                 stream.reset_solver()  # it was refused
                 return None
             stream.shorten_ramp(cycle.ramp_time)
             goal = 0.0 if cycle.flags & RAMPING_OUT else 1.0
             setpoint = stream.advance(state, cycle.nominal_q, loads, goal)
+            self._sent = cycle.written
             if cycle.written:
                 self._recording.write_setpoint(setpoint)
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
@@ -127,3 +131,10 @@ class ReplayedLoop(Loop):
             self._emit({"kind": EventKind.REFUSED, "detail": str(error)})
             return None
         return setpoint
+
+    def _take_back(self) -> None:
+        """Go on from the setpoint before the last one, which was refused or has lapsed."""
+        self._stream.take_back()
+        if self._sent:
+            self._recording.gate.take_back()
+            self._in_force.take_back()

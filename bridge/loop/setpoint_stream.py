@@ -12,7 +12,7 @@ from gapbridge.bridge.loop.offset_in_force import InForce
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.compensation import Compensator, Correction, wanted_pose
-from gapbridge.core.errors import StaleStateError
+from gapbridge.core.errors import LimitError, StaleStateError
 from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.limits import MAX_GAP_CYCLES, Limiter, Limits
 from gapbridge.core.loads import Loads
@@ -93,6 +93,7 @@ class NominalStream:
         self._motion[LIMIT] = velocity_limit
         self.q: Array = self._motion[POSITION]
         self._rate: Array = self._motion[RATE]
+        self._kept = self._motion.copy()
         _track(self._motion, self.q.copy(), 1.0)  # compiles it now: the loop must not wait
 
     def start(self, q: Array) -> None:
@@ -113,6 +114,14 @@ class NominalStream:
             self.q += 0.5 * gap * (self._rate + after)
             self._rate[:] = after
         return self.q
+
+    def keep(self) -> None:
+        """Remember the present motion for ``take_back``."""
+        self._kept[:] = self._motion
+
+    def take_back(self) -> None:
+        """Return to the motion of the last ``keep``."""
+        self._motion[:] = self._kept
 
     @property
     def at_rest(self) -> bool:
@@ -138,6 +147,7 @@ class SetpointStream:
         self._lead_time = 0.0  # s that the lead-in over it takes at least
         self._time_over(np.zeros(model.arm.n))  # compiles it now
         self._since_start = 0.0  # s
+        self._kept = (0.0, False, 0.0, 0.0)
         self.residual = 0.0  # m, of the last correction
         self.finite = True  # the last correction is finite
         self._loads = Loads()  # of the last correction
@@ -205,6 +215,30 @@ class SetpointStream:
         Raises LimitError, and StaleStateError after ``expiry`` (s, monotonic): then nothing has
         changed and nothing may be sent.
         """
+        self._keep()
+        try:
+            return self._advance(state, source_q, loads, goal, expiry)
+        except (LimitError, StaleStateError):
+            self.take_back()
+            raise
+
+    def _keep(self) -> None:
+        self.limiter.keep()
+        self._nominal.keep()
+        self._kept = (self._ramp, self._resumes, self._last, self._since_start)
+
+    def take_back(self) -> None:
+        """Go on from the setpoint before the last one: the last one is not in force.
+
+        Otherwise the next one could be farther from what is in force than the limits allow at once.
+        """
+        self.limiter.take_back()
+        self._nominal.take_back()
+        self._ramp, self._resumes, self._last, self._since_start = self._kept
+
+    def _advance(
+        self, state: RobotState, source_q: Array | None, loads: Loads, goal: float, expiry: float
+    ) -> Setpoint:
         gap = state.timestamp - self._last
         if gap < 0.0 and goal == 0.0:
             # the clock went back, which has ended the motion: the offset ramps out step by step

@@ -57,6 +57,8 @@ class Writing:
         self.has_armed = False  # the driver has been armed in this process
         self.unsent: Setpoint | None = None  # computed in the last cycle, not (completely) sent
         self.ramps_out = False  # the last setpoint's offset was ramping out
+        self.took_back = False  # the setpoint before the last one is not in force
+        self._refused = False  # the last setpoint computed was not sent, and never will be
         self.lost: str | None = None  # why the link is lost
         self._paused = False  # see ``take_paused``
         self._failed = 0  # setpoints in a row sent only in part
@@ -103,7 +105,7 @@ class Writing:
             self._refuse_start(str(error))
             return True
         self._source.begin(state.timestamp, start_q)
-        self._failed = 0
+        self._failed, self._refused = 0, False
         self._supervisor.take(Cause.WRITING)
         return False
 
@@ -152,7 +154,7 @@ class Writing:
 
         ``expiry`` (s, monotonic): after it no setpoint from this state may be sent.
         """
-        stream, self.unsent = self._stream, None
+        stream, self.unsent, self.took_back = self._stream, None, False
         self.ramps_out = self._supervisor.state == State.HOLDING
         if self._now() > expiry:
             stream.reset_solver()
@@ -163,6 +165,7 @@ class Writing:
         try:
             self._driver.keep_alive()  # may block: before the state's age is checked
             expiry = min(expiry, self._driver.unanswered_since() + self._hold)
+            self._take_back()
             setpoint = stream.advance(state, source_q, loads, goal, expiry)
         except StaleStateError:
             stream.reset_solver()
@@ -178,11 +181,11 @@ class Writing:
             return None
         try:
             if not stream.finite:
-                self.unsent = _copied(setpoint)
+                self._refuse(setpoint)
                 detail = "the model's correction is no number"
                 self._end_motion(LoopCounter.BAD_OUTPUT, Cause.BAD_OUTPUT, detail)
             elif self._now() > expiry:  # the system suspended this process since the check
-                self.unsent = _copied(setpoint)
+                self._refuse(setpoint)
                 self._reports.count(LoopCounter.LATE)
             else:
                 self._driver.write_setpoint(setpoint, expiry)
@@ -195,10 +198,26 @@ class Writing:
             self.unsent = _copied(setpoint)
             if isinstance(error, LateSetpointError):
                 self._reports.count(LoopCounter.LATE)
+        except GateError as error:
+            self._refuse(setpoint)
+            self._on_write_error(error)
         except WriteError as error:
             self.unsent = _copied(setpoint)
             self._on_write_error(error)
         return None
+
+    def _refuse(self, setpoint: Setpoint) -> None:
+        """Note a setpoint of which nothing was sent."""
+        self.unsent, self._refused = _copied(setpoint), True
+
+    def _take_back(self) -> None:
+        """Go on from what is in force where the last setpoint is not."""
+        lapsed = self._driver.take_lapsed()
+        if lapsed:
+            self._in_force.take_back()
+        if lapsed or self._refused:
+            self._stream.take_back()
+            self.took_back, self._refused = True, False
 
     def _check_solved(self) -> None:
         """End the motion if the model has no correction; the offset ramps out."""

@@ -30,6 +30,7 @@ class RpdoWriter:
         self._last: Frames = []
         self._in_force: tuple[Frames, Array | None] = [], None  # frames, target at the last SYNC
         self._expires = math.inf  # s, monotonic: after it, ``_last`` must not take effect any more
+        self._lapsed = False  # see ``take_lapsed``
         self.partial = False  # the drives hold a part of a set, until a SYNC
         self.reverted = 0  # sets that were sent in part and reverted
         self.target: Array | None = None  # (n,) rad, of the last whole set
@@ -48,6 +49,12 @@ class RpdoWriter:
         """Drop the last set: the drives' own state is valid now."""
         self._last, self.partial, self.target = [], False, None
         self._in_force, self._expires = ([], None), math.inf
+        self._lapsed = False
+
+    def take_lapsed(self) -> bool:
+        """Return, once, whether a whole set was replaced by the one in force: too late a SYNC."""
+        lapsed, self._lapsed = self._lapsed, False
+        return lapsed
 
     def send(self, controlwords: Sequence[int], q: Array, expires: float = math.inf) -> None:
         """Send Controlwords and joint targets (n,), rad; they count at the next SYNC.
@@ -103,7 +110,7 @@ class RpdoWriter:
         Raises LinkError if a set is still partial.
         """
         if now > self._expires:
-            self._expires, self.partial = math.inf, True
+            self._expires, self.partial, self._lapsed = math.inf, True, True
             self._last, self.target = self._in_force
         if self.partial:
             done = self._revert()

@@ -279,6 +279,9 @@ class CanopenDriver(Driver):
         expires = sample.received + max(LONGEST_WAIT, LONGEST_WAIT_CYCLES * self._period)
         self.writer.send([self.power.following] * self.n, setpoint.q, expires)
 
+    def _take_lapsed(self) -> bool:
+        return self.writer.take_lapsed()
+
     def _release(self) -> None:
         """Quick stop, then switch the drives off and give them back their mode."""
         if self._armed_at is None:

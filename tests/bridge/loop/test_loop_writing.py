@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import Correction
 from gapbridge.core.errors import (
     ForeignCommandError,
+    GateError,
     IneffectiveWriteError,
     LateSetpointError,
     LinkError,
@@ -52,6 +53,7 @@ class Failing(Driver):
     def __init__(self) -> None:
         super().__init__(500.0, MODEL)
         self.error: LinkError | None = None
+        self.lapsed = False
         self.sent: list[np.ndarray] = []
         self.released = 0
         self.taken: float | None = None  # s, of a question and its answer
@@ -71,6 +73,10 @@ class Failing(Driver):
         if self.error is not None:
             raise self.error
         self.sent.append(setpoint.q.copy())
+
+    def _take_lapsed(self) -> bool:
+        lapsed, self.lapsed = self.lapsed, False
+        return lapsed
 
     def _release(self) -> None:
         self.released += 1
@@ -280,6 +286,83 @@ def test_a_setpoint_that_waits_for_a_busy_robot_is_neither_sent_nor_in_force(ben
     bench.driver.error = None  # its way ends: the newest setpoint leaves
     bench.cycles(1)
     assert bench.driver.sent[-1] == pytest.approx(Q, abs=1e-12)
+
+
+def _is_late(bench: Bench) -> None:
+    limit = bench.stream.limiter.limit
+    bench.stream.limiter.limit = lambda *given: (limit(*given), time.sleep(0.03))[0]  # type: ignore[method-assign]
+    state = bench.state()
+    bench.writing.write(state, Q, bench.loads.update(state), time.monotonic() + 0.02)
+    bench.stream.limiter.limit = limit  # type: ignore[method-assign]
+
+
+def _is_refused(bench: Bench) -> None:
+    bench.driver.error = GateError("gate: refused")
+    bench.cycles(1)
+    bench.driver.error = None
+
+
+def _lapses(bench: Bench) -> None:
+    bench.cycles(1)
+    bench.driver.lapsed = True
+
+
+@pytest.mark.parametrize("never_in_force", [_is_late, _is_refused, _lapses])
+def test_a_stream_goes_on_from_what_is_in_force(
+    bench: Bench, never_in_force: Callable[[Bench], None]
+) -> None:
+    """The offset ramps in by up to 5 cycles' allowance at once; not by 6 from what is in force."""
+    bench.stream.limiter._block[2] = rate = 1e-4  # m/s: the limiter's, less than the ramp wants
+    bench.cycles(20)
+    in_force = bench.stream.limiter.offset_in_base
+    stored = bench.writing._in_force.offset_at(bench.driver.sent[-1])
+    never_in_force(bench)
+    moved = bench.stream.limiter.offset_in_base - in_force
+    assert np.linalg.norm(moved[:3]) > 0.5 * rate * T
+    bench.at += 20 * T  # a gap
+    bench.supervisor.state = State.COMPENSATING
+    written = len(bench.driver.sent)
+    bench.cycles(1)
+    assert len(bench.driver.sent) == written + 1
+    step = np.linalg.norm((bench.stream.limiter.offset_in_base - in_force)[:3])
+    assert 4.9 * rate * T < step <= 5.0 * rate * T * (1.0 + 1e-9)
+    assert stored is not None
+    bench.writing._in_force.take_back()
+    before = bench.writing._in_force.offset_at(Q)
+    assert before is not None and (before.delta == stored.delta).all()
+
+
+def test_what_has_lapsed_is_taken_back_once(bench: Bench) -> None:
+    bench.cycles(20)
+    _lapses(bench)
+    bench.cycles(1)
+    assert bench.writing.took_back
+    first = bench.stream.limiter.offset_in_base
+    bench.cycles(1)
+    assert not bench.writing.took_back
+    assert (np.linalg.norm(bench.stream.limiter.offset_in_base - first)) > 0.0
+
+
+def test_an_offset_that_never_took_effect_is_not_kept_for_the_next_start(bench: Bench) -> None:
+    bench.cycles(20)
+    stored = bench.writing._in_force.offset_at(Q)
+    _lapses(bench)
+    noted = bench.writing._in_force.offset_at(Q)
+    bench.driver.error = GateError("gate: refused")
+    bench.cycles(1)
+    found = bench.writing._in_force.offset_at(Q)
+    assert stored is not None and noted is not None and found is not None
+    assert (noted.delta != stored.delta).any()
+    assert (found.delta == stored.delta).all()
+
+
+def test_the_gate_judges_from_what_is_in_force(bench: Bench) -> None:
+    bench.cycles(20)
+    before = bench.driver.gate._joints[2].copy()
+    _lapses(bench)
+    assert (bench.driver.gate._joints[2] != before).any()
+    assert bench.driver.take_lapsed()
+    assert (bench.driver.gate._joints[2] == before).all()
 
 
 def test_the_driver_is_given_until_when_a_setpoint_may_take_effect(bench: Bench) -> None:

@@ -22,7 +22,7 @@ from gapbridge.bridge.loop.replay import ReplayedLoop
 from gapbridge.bridge.recording.recorder import Recorder
 from gapbridge.bridge.setpoint_source.source import SourceContext
 from gapbridge.bridge.setpoint_source.target import TargetSource
-from gapbridge.core.errors import LinkError, PartialWriteError
+from gapbridge.core.errors import GateError, LinkError, PartialWriteError
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
@@ -50,6 +50,7 @@ class Scripted(Driver):
         self._commands = commands
         self._writes = itertools.count(1)
         self._random = np.random.default_rng(3)
+        self._cycle, self._lapses = 0, False
 
     def connect(self) -> None:
         pass
@@ -61,6 +62,7 @@ class Scripted(Driver):
         k = next(self._count, None)
         if k is None:
             raise LinkError("the script has come to its end")
+        self._cycle = k
         if k in (700, 1500):
             self._commands.ask(Command.DISARM)
         if k in (20, 900):
@@ -77,8 +79,16 @@ class Scripted(Driver):
         )  # fmt: skip
 
     def _send(self, setpoint: Setpoint) -> None:
-        if next(self._writes) % 53 == 0:
+        count, self._lapses = next(self._writes), False
+        if count % 53 == 0:
             raise PartialWriteError("half of it")
+        if self._cycle == 310:
+            raise GateError("gate: no")
+        self._lapses = count % 37 == 0
+
+    def _take_lapsed(self) -> bool:
+        lapsed, self._lapses = self._lapses, False
+        return lapsed
 
 
 def run(
@@ -108,6 +118,8 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     assert (flags & 1).any()  # sensor lost
     assert (flags & 4).any()  # gap
     assert (flags & 8).any()  # ramping out
+    assert ((flags & 64) > 0).sum() > 10  # after setpoints that have lapsed
+    assert flags[311] & 64, "after the refused one"
     assert then["written"].sum() > 500
 
     memory, commands = SharedMemory(N, clock=SYSTEM), CommandMemory()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gapbridge.bridge.cell.sections import LimitSettings
 from gapbridge.bridge.loop.setpoint_stream import (
@@ -14,7 +16,7 @@ from gapbridge.bridge.loop.setpoint_stream import (
 )
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import Correction, correct
-from gapbridge.core.errors import LimitError
+from gapbridge.core.errors import LimitError, StaleStateError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
@@ -241,3 +243,46 @@ def test_a_command_that_lags_has_not_arrived_until_it_is_there() -> None:
     assert not run.stream.arrived
     run.cycles(400, source=end)
     assert run.stream.arrived
+
+
+def test_what_is_refused_changes_nothing() -> None:
+    """A braking motion would otherwise be ahead of its command."""
+    run = Run()
+    for k in range(100):
+        run.cycles(1, Q + 0.001 * k)
+    held = run.stream._nominal._motion.copy(), run.stream.limiter._block.copy(), run.stream._last
+    moment = state(run.at, run.q)
+    with pytest.raises(StaleStateError):
+        run.stream.advance(moment, None, LIGHT, 0.0, expiry=-1.0)
+    with pytest.raises(LimitError):
+        run.stream.advance(state(run.at, run.q + 1.0), None, LIGHT, 0.0)
+    run.stream.advance(moment, None, LIGHT, 0.0)
+    run.stream.take_back()
+    assert (run.stream._nominal._motion == held[0]).all()
+    assert (run.stream.limiter._block == held[1]).all()
+    assert run.stream._last == held[2]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([0.0, 1.0]), st.booleans(), st.integers(1, 12)),
+        min_size=2, max_size=25,
+    )
+)  # fmt: skip
+def test_no_step_between_setpoints_in_force_is_longer_than_five_cycles_allow(
+    cycles: list[tuple[float, bool, int]],
+) -> None:
+    """Whatever is refused or lapses in between: goal of the ramp, in force, cycles since."""
+    run = Run(soft=5e-5, offset_rate=1e-3)
+    in_force, gap = np.zeros(6), 0
+    for goal, effective, waited in cycles:
+        run.at += (waited - 1) * CYCLE
+        gap += waited
+        found = run.cycles(1, goal=goal).offset_in_base
+        if not effective:
+            run.stream.take_back()
+            continue
+        step = float(np.linalg.norm((found - in_force)[:3]))
+        assert step <= 1e-3 * CYCLE * min(gap, 5) * (1.0 + 1e-9)
+        in_force, gap = found, 0

@@ -134,7 +134,11 @@ def test_a_setpoint_whose_sync_comes_too_late_never_takes_effect(
         target = settled(driver).target_q
     assert np.abs(hold - generic.controller.q).max() < 1e-5
     assert np.abs(hold - target).max() < 1e-5
+    assert driver.take_lapsed(), "the loop must go on from what is in force"
+    assert not driver.take_lapsed(), "once"
     driver.write_setpoint(setpoint(hold + 0.001, settled(driver)))
+    settled(driver)
+    assert not driver.take_lapsed()
 
 
 class _Failing:
