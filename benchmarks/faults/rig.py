@@ -17,10 +17,8 @@ from benchmarks.faults.running import Running
 from benchmarks.faults.tap import Tap
 from benchmarks.ports import own_host
 from gapbridge.bridge.ipc.loop_state import State
-from gapbridge.core.errors import LinkError
 
 SOME = 40  # messages decoded at a time
-STARTS = 3
 REPORTED = 1.0  # s within which an event has come from the loop to here, on any machine
 WARM_UP = 0.12  # s of compensating before a fault is made
 START_LIMIT, RECOVERY_LIMIT = 180.0, 120.0  # s: on a machine that has much else to do
@@ -96,17 +94,10 @@ class Rig:
             be_ordinary()
 
     def start_daemon(self) -> None:
-        """Start a run, observing; again where a busy machine was too slow for the first words."""
-        for left in reversed(range(STARTS)):
-            self._runs.append(Running(self.cell, **self._changed))
-            self.run.start()
-            try:
-                self.wait(State.OBSERVING, START_LIMIT)
-            except LinkError:
-                if not left:
-                    raise
-            else:
-                return
+        """Start a run, observing."""
+        self._runs.append(Running(self.cell, **self._changed))
+        self.run.start()
+        self.wait(State.OBSERVING, START_LIMIT)
 
     def wait(self, state: State, limit: float) -> None:
         """Wait for a state of the loop. Raises TimeoutError, and what the daemon ended with."""

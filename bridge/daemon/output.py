@@ -24,7 +24,7 @@ class Output:
     def __init__(self, say: Callable[[str], None], clock: Clock) -> None:
         self._say, self._clock = say, clock
         self._waiting: queue.Queue[Callable[[], None] | None] = queue.Queue(MOST_WAITING)
-        self._left_out = 0
+        self._left_out, self._counting = 0, threading.Lock()
         self._written = threading.Event()
         threading.Thread(target=self._write, name="output", daemon=True).start()
 
@@ -35,7 +35,8 @@ class Output:
             try:
                 self._waiting.put_nowait(lambda: write(line))
             except queue.Full:
-                self._left_out += 1
+                with self._counting:
+                    self._left_out += 1
 
         return put
 
@@ -50,8 +51,9 @@ class Output:
     def _write(self) -> None:
         while (line := self._waiting.get()) is not None:
             self._try(line)
-            if self._left_out:
+            with self._counting:
                 count, self._left_out = self._left_out, 0
+            if count:
                 self._try(lambda n=count: self._say(f"{n} lines left out: output was blocked"))  # type: ignore[misc]
         self._written.set()
 

@@ -62,8 +62,9 @@ def ended_by(number: signal.Signals) -> Apart:
             left = math.hypot(*rig.checker.last_offset[:3])
             # where joints are written, an arm that stays where it is is all that is wanted
             if left > 5.0 * rig.checker.bounds.grain and not link.moves_arm:
-                words = f"an offset of {1e6 * left:.1f} um was left behind"
-                wrong.append(f"{words}: {run.output[-900:]}")
+                words = f"an offset of {1e6 * left:.1f} um was left behind in {run.state.name}"
+                counted = {name: count for name, count in run.memory.counts().items() if count}
+                wrong.append(f"{words}; {counted}: {run.output[-900:]}")
             step, late = found.largest_step, rig.witness.late(moment)
             rig.link.prepare(rig.controller, rig.back)
             rig.start_daemon()  # with what the former has left behind: nothing is cleaned
