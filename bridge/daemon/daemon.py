@@ -19,20 +19,18 @@ from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.run_settings import Configuration, configuration_for, settings_of
-from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder, state_folder
+from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.fitted_watch import FittedWatch
-from gapbridge.bridge.daemon.kept_rests import KeptRests
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.daemon.side_processes import SideProcesses
-from gapbridge.bridge.daemon.slip_watch import SlipWatch
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import RunSummary, Tally
-from gapbridge.bridge.daemon.verification_watch import VerificationWatch
+from gapbridge.bridge.daemon.zero_watch import ZeroWatch
 from gapbridge.bridge.document.output_file import private, require_folder
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.control_socket import ControlSocket
@@ -98,9 +96,10 @@ class Daemon:
         self.session = ""
         self._status = DaemonStatus(self.memory.slices, clock)
         self._fitted = FittedWatch(configuration.fitted, self.memory.slices)
-        self._slips = self._slip_watch()
-        self._kept = KeptRests(clock)
-        self._verification = VerificationWatch(None if settings.uncorrected else settings.cell)
+        self._zeros = ZeroWatch(
+            configuration, self.memory.slices, self._status, self.event_log.add,
+            self._commands.ask, clock,
+        )  # fmt: skip
         self._status_at = 0.0
         self._reload = Reload(self.manager, self.event_log)
         self.control = Control(self, clock)
@@ -149,7 +148,7 @@ class Daemon:
     @property
     def mark_problem(self) -> str:
         """Return why an acknowledged mark of a failed verification is still there; empty: no."""
-        return self._verification.problem
+        return self._zeros.verification.problem
 
     @property
     def sequence(self) -> int:
@@ -196,7 +195,7 @@ class Daemon:
             "armed_by": self.armed_by,
             "latched": status.latched,
             "correction": status.correction,
-            "zeros": self._slips.detail,
+            "zeros": self._zeros.slips.detail,
             "loop": {
                 "pid": self.loop_pid,
                 "restarts": self.restarts,
@@ -217,39 +216,11 @@ class Daemon:
             "lost_rows": self.lost_rows,
         }
 
-    def _slip_watch(self) -> SlipWatch:
-        smallest = self.settings.limits.zero_slip
-        return SlipWatch(self.configuration.model, self.memory.slices, smallest)
-
     def _take_configuration(self, new: Configuration) -> None:
-        """Take what the next loop runs with; what was learned stays while it is the same."""
-        same = new.fingerprint == self.configuration.fingerprint
+        """Take what the next loop runs with."""
         self.configuration = new
         self._fitted = FittedWatch(new.fitted, self.memory.slices)
-        if same:
-            self._slips.interrupt()
-        else:
-            self._slips = self._slip_watch()
-        self._keep_rests(at_once=True)
-
-    def _open_kept_rests(self) -> None:
-        """Continue with what the run before has learned of the joints' zeros."""
-        settings = self.settings
-        if settings.uncorrected or settings.link.driver == "replay" or not self._slips.watches:
-            return
-        try:
-            path = state_folder() / f"{cell_key(settings.cell)}.rests.json"
-            detail = self._kept.open(path, self._slips, self.configuration)
-        except InputError as error:
-            detail = f"{error}; what is learned of joints' zeros is lost at the end"
-        if detail:
-            self.event_log.add({"kind": EventKind.NOTE, "detail": detail})
-
-    def _keep_rests(self, at_once: bool = False) -> None:
-        if detail := self._kept.step(self._slips, self.configuration, at_once):
-            self.event_log.add(
-                {"kind": EventKind.WARNING, "what": "rests_not_kept", "detail": detail}
-            )
+        self._zeros.configure(new)
 
     def note(self, event: Event) -> None:
         """Queue an event, which the daemon's thread emits."""
@@ -302,34 +273,10 @@ class Daemon:
                 {"kind": EventKind.REQUEST, "command": name, "number": number, "by": by,
                  "acknowledges": command == Command.DISARM, "detail": detail}
             )  # fmt: skip
-            if command == Command.DISARM:
-                self._verification.acknowledge()
-            if command == Command.DISARM or not moved:
-                self._check_zeros()
-            if command == Command.DISARM and moved:
-                self._slips.reset()
-                self._keep_rests(at_once=True)
-            blocked = self._verification.blocked
-            if command == Command.ARM and (why := self._status.zero_moved or blocked):
-                detail = why if why == blocked else f"{why}; acknowledge it first: gapbridge disarm"
-                self.event_log.add({"kind": EventKind.REFUSED, "what": "arm", "detail": detail})
+            if obstacle := self._zeros.obstacle_to(command, moved):
+                self.event_log.add({"kind": EventKind.REFUSED, "what": name, "detail": obstacle})
                 continue
             self._commands.ask(command, number)
-
-    def _check_zeros(self) -> None:
-        """Hold if a verification has failed, until its mark is removed, or for an earlier slip."""
-        slip = self._kept.slip_of_earlier_run()
-        if slip is not None:
-            self.event_log.add(slip)
-            self._commands.ask(Command.ZERO_MOVED)
-        event = self._verification.look()
-        if event is None:
-            return
-        self.event_log.add(event)
-        if not event["holds"]:
-            self._commands.ask(Command.ZERO_MOVED)  # after the event that says why
-        elif not self.latched:
-            self._commands.ask(Command.DISARM)  # else a person's, who sees what else is latched
 
     # -- the run ----------------------------------------------------------------------------------
 
@@ -377,9 +324,8 @@ class Daemon:
         stack.callback(self._close_side_processes)
         self.side_processes.start(settings, start_data, self.memory, self._output)
         stack.callback(lambda: self.event_log.add({"kind": EventKind.ENDED}))
-        self._open_kept_rests()
-        stack.callback(self._kept.close)
-        stack.callback(self._keep_rests, at_once=True)
+        self._zeros.open()
+        stack.callback(self._zeros.close)
         path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
         try:
             stack.enter_context(ControlSocket(path, self.control.answer))
@@ -441,8 +387,8 @@ class Daemon:
             self.event_log.add(self._posted.get())
         if self._clock.monotonic() >= self._status_at:
             self._status_at = self._clock.monotonic() + STATUS_EVERY
-            self._check_zeros()
-            self._keep_rests()
+            self._zeros.check()
+            self._zeros.keep()
             self.side_processes.emit({"kind": EventKind.STATUS, **self.status()})
         loop = self.loop
         if loop is None or not loop.hangs:
@@ -532,17 +478,13 @@ class Daemon:
             self.event_log.add(
                 {"kind": EventKind.WARNING, "what": "outside_fitted", "detail": detail}
             )
-        for event in self._slips.take(rows):
-            self.event_log.add(event)
-            if event["kind"] == EventKind.SLIP:
-                self._commands.ask(Command.ZERO_MOVED)  # after the event that says why
-                self._keep_rests(at_once=True)
+        self._zeros.take(rows)
 
     def _on_event(self, event: Event) -> None:
         """Act on an event, and print it on the terminal."""
         kind, detail = event["kind"], str(event.get("detail", ""))
         self._status.on_event(event)
-        self._kept.on_event(event)
+        self._zeros.kept.on_event(event)
         self._note_latched()
         self._reload.on_event(event)
         if kind == EventKind.FAILURE:

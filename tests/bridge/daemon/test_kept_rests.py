@@ -240,13 +240,13 @@ def test_a_disk_that_cannot_be_written_is_told_once(
 def test_a_loop_that_dies_leaves_the_watch_as_it_is_and_a_changed_cell_does_not() -> None:
     with rides_on_a_program() as (run, world):
         daemon = run.daemon
-        before = daemon._slips
+        before = daemon._zeros.slips
         run.loops[-1].kill()
         until(world, lambda: len(run.loops) > 1 and daemon.state == State.OBSERVING, 10.0)
-        assert daemon._slips is before
+        assert daemon._zeros.slips is before
         cell = daemon.configuration
         daemon._take_configuration(replace(cell, text=cell.text + "\n"))
-        assert daemon._slips is not before
+        assert daemon._zeros.slips is not before
 
 
 def test_a_slip_that_nobody_has_acknowledged_holds_the_next_run_of_the_daemon(
@@ -256,15 +256,15 @@ def test_a_slip_that_nobody_has_acknowledged_holds_the_next_run_of_the_daemon(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     with rides_on_a_program() as (run, world):
         daemon, begun = run.daemon, world.now
-        daemon._open_kept_rests()
-        daemon._slips.take = lambda rows: [FOUND] if world.now < begun + 0.02 else []  # type: ignore[method-assign]
+        daemon._zeros.open()
+        daemon._zeros.slips.take = lambda rows: [FOUND] if world.now < begun + 0.02 else []  # type: ignore[method-assign]
         until(world, lambda: daemon.state == State.OBSERVING, 3.0)
-        daemon._kept.close()
+        daemon._zeros.kept.close()
     assert [p.parent.name for p in tmp_path.rglob("*.rests.json")] == ["gapbridge"]
     for acknowledge in (True, False):
         with rides_on_a_program(arm=False) as (run, world):
             daemon = run.daemon
-            daemon._open_kept_rests()
+            daemon._zeros.open()
             if acknowledge:
                 until(world, lambda d=daemon: d.latched == FOUND["detail"], 3.0)  # type: ignore[misc]
                 until(world, lambda d=daemon: d.status()["counts"]["zero_moved"] == 1, 3.0)  # type: ignore[misc]
@@ -272,7 +272,7 @@ def test_a_slip_that_nobody_has_acknowledged_holds_the_next_run_of_the_daemon(
                 assert FOUND["detail"] in ask(run, "arm")["error"]
                 assert ask(run, "disarm")["ok"]
             assert ask(run, "arm")["answer"] == "compensating"
-            daemon._kept.close()
+            daemon._zeros.kept.close()
 
 
 def test_the_state_folder_is_the_service_managers_or_the_users_own(

@@ -116,7 +116,7 @@ def test_a_slip_holds_the_run_until_a_person_has_seen_it() -> None:
         daemon = run.daemon
         found = slip_event(Slip((4, 3), 0.0098, 0.0007, 12.0, 4))
         begun = world.now
-        daemon._slips.take = lambda rows: [found] if world.now < begun + 0.02 else []  # type: ignore[method-assign]
+        daemon._zeros.slips.take = lambda rows: [found] if world.now < begun + 0.02 else []  # type: ignore[method-assign]
         until(world, lambda: daemon.state == State.OBSERVING, 3.0)
         assert causes(run)[-2:] == ["zero moved", "ramped out"]
         (event,) = [e for e in daemon.event_log.recent if e["kind"] == "slip"]
@@ -142,7 +142,7 @@ def test_a_slip_stays_latched_over_a_loop_that_dies() -> None:
     with rides_on_a_program() as (run, world):
         daemon, begun = run.daemon, world.now
         found = slip_event(Slip((2,), 0.02, 0.001, 1.0, 4))
-        daemon._slips.take = lambda rows: [found] if world.now < begun + 0.02 else []  # type: ignore[method-assign]
+        daemon._zeros.slips.take = lambda rows: [found] if world.now < begun + 0.02 else []  # type: ignore[method-assign]
         until(world, lambda: daemon.state == State.OBSERVING, 3.0)
         run.loops[-1].kill()
         until(world, lambda: len(run.loops) > 1 and daemon.state == State.FAULT, 10.0)
@@ -170,7 +170,7 @@ def test_a_zero_that_slips_in_a_run_is_found_within_three_rounds_of_its_program(
                 world.run(world.now + 0.8, lambda: events.counts["slip"] > 0)
 
         go_round(5)
-        assert run.daemon._slips.learned
+        assert run.daemon._zeros.slips.learned
         assert run.daemon.state == State.COMPENSATING
         assert events.counts["warning"] == events.counts["slip"] == 0
         link.controller.plant.slip(4, 0.010)

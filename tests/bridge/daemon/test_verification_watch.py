@@ -104,7 +104,7 @@ def test_a_mark_found_between_two_loops_is_counted_by_the_next(cell: Path) -> No
         run.loops[-1].kill()
         until(world, lambda: run.daemon.loop is None, 3.0)
         write_mark(cell, REASON, cell.parent)
-        run.daemon._check_zeros()
+        run.daemon._zeros.check()
         assert counted(run) == 0
         until(world, lambda: counted(run) == 1, 10.0)
         assert not ask(run, "arm")["ok"]
@@ -201,13 +201,13 @@ def test_a_folder_that_does_not_answer_keeps_no_disarm_waiting_and_nothing_is_ar
     with rides_on_a_program() as (run, world):
         until(world, lambda: run.daemon.state == State.COMPENSATING, 3.0)
         answers.clear()
-        until(world, lambda: "does not answer" in run.daemon._verification.blocked, 2.0)
+        until(world, lambda: "does not answer" in run.daemon._zeros.verification.blocked, 2.0)
         assert run.daemon.state == State.COMPENSATING
         assert ask(run, "disarm")["answer"] == "observing"
         reply = ask(run, "arm")
         assert f"{mark_path(cell).parent}: the file system does not answer" in reply["error"]
         answers.set()
-        until(world, lambda: not run.daemon._verification.blocked, 3.0)
+        until(world, lambda: not run.daemon._zeros.verification.blocked, 3.0)
         assert ask(run, "arm")["answer"] == "compensating"
 
 
