@@ -21,6 +21,7 @@ from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.summary import RunSummary
+from gapbridge.bridge.daemon.verification_watch import VerificationWatch
 from gapbridge.bridge.ipc.command_memory import CommandMemory, Commands
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
@@ -179,10 +180,13 @@ class Run:
 class SimulatedDaemon(Daemon):
     """The product's daemon without sockets and side processes."""
 
+    longest_wait: float | None = None  # s of real time for the file system of the cell
+
     def __init__(self, configuration: Configuration, run: Run) -> None:
         self._run = run
         super().__init__(configuration, may_write=True, clock=run.clock)
         self.loop_process = lambda *given: SimulatedLoop(run, *given)  # type: ignore[assignment]
+        self._zeros.verification = VerificationWatch(self.settings.cell, self.longest_wait)
 
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
         return self._take_over(stack.enter_context(_Lock(self._run)), arm, by)

@@ -16,10 +16,13 @@ LONGEST_WAIT = 0.2  # s for a file system; a network mount may hang, and no disa
 
 
 class VerificationWatch:
-    """Reports when the mark of a cell comes, changes or goes; None: there is no cell to watch."""
+    """Reports when the mark of a cell comes, changes or goes; None: there is no cell to watch.
 
-    def __init__(self, cell: Path | None) -> None:
-        self._cell = cell
+    ``longest_wait``: s of real time for a call of the file system; None: until it has ended.
+    """
+
+    def __init__(self, cell: Path | None, longest_wait: float | None = LONGEST_WAIT) -> None:
+        self._cell, self._longest_wait = cell, longest_wait
         self._reason = ""  # of the mark that was reported last; empty: none
         self._call: _Call | None = None  # that has not ended in time
         self.problem = ""  # why an acknowledged mark is still there
@@ -57,7 +60,7 @@ class VerificationWatch:
             return None
         self._call = call = _Call(what, self._cell)
         call.start()
-        call.join(LONGEST_WAIT)  # of the file system's own time
+        call.join(self._longest_wait)
         if call.is_alive():
             return None
         self._call = None

@@ -11,6 +11,7 @@ from simulated_daemon import ask, causes, rides_on_a_program, until
 
 from benchmarks.simulation.links import setting_of
 from benchmarks.simulation.processes import Run as SimulatedRun
+from benchmarks.simulation.processes import SimulatedDaemon
 from gapbridge.bridge.cell.verification_mark import mark_path, remove_mark, write_mark
 from gapbridge.bridge.daemon import verification_watch
 from gapbridge.bridge.daemon.verification_watch import VerificationWatch
@@ -193,11 +194,11 @@ def test_a_folder_that_does_not_answer_keeps_no_disarm_waiting_and_nothing_is_ar
     answers.set()
 
     def hangs(_: Path) -> str:
-        answers.wait(2.0)
+        answers.wait(10.0)
         return ""
 
     monkeypatch.setattr(verification_watch, "read_mark", hangs)
-    monkeypatch.setattr(verification_watch, "LONGEST_WAIT", 0.01)
+    monkeypatch.setattr(SimulatedDaemon, "longest_wait", 1.0)  # waited for once
     with rides_on_a_program() as (run, world):
         until(world, lambda: run.daemon.state == State.COMPENSATING, 3.0)
         answers.clear()
@@ -207,6 +208,9 @@ def test_a_folder_that_does_not_answer_keeps_no_disarm_waiting_and_nothing_is_ar
         reply = ask(run, "arm")
         assert f"{mark_path(cell).parent}: the file system does not answer" in reply["error"]
         answers.set()
+        call = run.daemon._zeros.verification._call
+        assert call is not None
+        call.join()
         until(world, lambda: not run.daemon._zeros.verification.blocked, 3.0)
         assert ask(run, "arm")["answer"] == "compensating"
 
