@@ -236,10 +236,14 @@ def _with_derivatives(motion: Motion, measured_qd: Array | None, new_session: Ma
     steps = np.diff(motion.t)
     step = float(np.median(steps))
     stretch = np.concatenate([[0], np.cumsum((steps > GAP * step) | new_session)])
+    # a gap shorter than the shortest window is interpolated (a Panda's of 10 to 20 ms); a delayed
+    # command is not known in it, so that it ends a stretch all the same
+    ends = (steps > max(GAP * step, WINDOWS[-1])) | new_session
+    smooth = np.concatenate([[0], np.cumsum(ends)])
     qd, qdd = np.zeros_like(motion.q), np.zeros_like(motion.q)
     valid, noise = np.zeros(len(motion), dtype=bool), np.zeros(motion.q.shape[1])
-    for number in range(int(stretch[-1]) + 1):
-        part = np.flatnonzero(stretch == number)
+    for number in range(int(smooth[-1]) + 1):
+        part = np.flatnonzero(smooth == number)
         if len(part) < 15:
             continue
         result = _derivatives(

@@ -275,7 +275,8 @@ class LoopChecks:
                         {"kind": EventKind.DEGRADED, "what": "", "detail": "the sensor is back"}
                     )
             return
-        changed = cause is not None and self._supervisor.take(cause, detail)
+        faulty = self._supervisor.state == State.FAULT  # the first fault is what is latched
+        changed = cause is not None and not faulty and self._supervisor.take(cause, detail)
         if counter in self._active:
             return
         self._active.add(counter)

@@ -43,6 +43,7 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.robot_modes import why_not_ready
 
 STOP_TIMEOUT = 1.0  # s from a stop request to the release, plus the ramp at the cell's rates
 STOP_RAMP_TIME = 0.5  # s: longest ramp when stopping
@@ -252,7 +253,21 @@ class Loop:
         """Act on the result of writing: states not read meanwhile, or a lost link."""
         if self._writing.take_paused():
             self._restart_checks()
+        if self._writing.lost is not None:
+            self._latch_stop()
         self._end_on_lost_link(self._writing.lost)
+
+    def _latch_stop(self) -> None:
+        """Latch a stop of the robot that has made a write fail before its state was read.
+
+        As a failed write alone it would end with the link.
+        """
+        try:
+            why = why_not_ready(self._driver.read_state())
+        except LinkError:
+            return
+        if why and self._supervisor.take(Cause.UNSAFE, why):
+            self._memory.count(LoopCounter.UNSAFE)
 
     def _end_on_lost_link(self, detail: str | None) -> None:
         """End this process if the link is lost (``detail``): only a new one may reconnect."""

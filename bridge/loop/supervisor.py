@@ -70,6 +70,7 @@ TRANSITIONS: dict[tuple[State, Cause], State] = {
     (_S.HOLDING, _C.FOREIGN): _S.FAULT,
     (_S.HOLDING, _C.INEFFECTIVE): _S.FAULT,
     **{(_S.HOLDING, cause): _S.FAULT for cause in STOPS_AT_ONCE},
+    (_S.FAULT, _C.UNSAFE): _S.FAULT,  # the stop that made a write fail; it stays latched
     (_S.FAULT, _C.ACKNOWLEDGED): _S.OBSERVING,
     **{(s, _C.LINK_LOST): _S.DISCONNECTED for s in State if s},
 }

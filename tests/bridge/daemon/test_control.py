@@ -15,6 +15,8 @@ from typing import Any
 import pytest
 from daemon_cell import Robot, Run, gapbridge
 from patience import PATIENCE, wait_for
+from simulated_daemon import ask as ask_in_simulation
+from simulated_daemon import rides_on_a_program, until
 
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.cell.verification_mark import write_mark
@@ -162,19 +164,18 @@ def test_a_person_arms_and_disarms_a_running_daemon(robot: Robot) -> None:
     assert not any(runtime_folder().glob("*.sock"))
 
 
-def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then(robot: Robot) -> None:
-    cell = robot.cell(PATIENT)
-    with Run(cell, arm=True) as run:
-        run.compensate()
-        robot.bench("protective_stop")
-        run.wait(State.FAULT)
-        with pytest.raises(RunError, match=r"a fault is latched: robot not ready.*safety_mode 3"):
-            ask(cell, "arm")
-        assert "as soon as the robot is fine" in ask(cell, "disarm")
+def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then() -> None:
+    with rides_on_a_program() as (run, world):
+        run.link.controller.protective_stop()
+        until(world, lambda: run.daemon.state == State.FAULT)
+        refused = ask_in_simulation(run, "arm")["error"]
+        assert "a fault is latched: robot not ready" in refused
+        assert "safety_mode 3" in refused
+        assert "as soon as the robot is fine" in ask_in_simulation(run, "disarm")["answer"]
         assert run.daemon.state == State.FAULT
-        robot.bench("unlock")
-        run.wait(State.OBSERVING)
-        wait_for(lambda: ask(cell, "status")["latched"] == "", "no fault latched")
+        run.link.controller.unlock()
+        until(world, lambda: run.daemon.state == State.OBSERVING)
+        until(world, lambda: run.daemon.status()["latched"] == "")
 
 
 @pytest.mark.slow

@@ -155,6 +155,7 @@ def test_a_run_of_given_length_ends_also_where_its_controller_has_gone(tmp_path:
     assert summary.restarts >= 1
 
 
+@pytest.mark.realtime(limit=0.03)  # later than that, a stalled loop has ended the motion
 def test_a_protective_stop_is_a_fault_and_nobody_writes_after_it(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()

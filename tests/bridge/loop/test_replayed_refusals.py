@@ -50,7 +50,7 @@ class Scripted(Driver):
         self._commands = commands
         self._writes = itertools.count(1)
         self._random = np.random.default_rng(3)
-        self._cycle, self._lapses = 0, False
+        self._cycle, self._lapses, self.refused_at = 0, False, -1
 
     def connect(self) -> None:
         pass
@@ -82,7 +82,8 @@ class Scripted(Driver):
         count, self._lapses = next(self._writes), False
         if count % 53 == 0:
             raise PartialWriteError("half of it")
-        if self._cycle == 310:
+        if self.refused_at < 0 and self._cycle >= 310:
+            self.refused_at = self._cycle
             raise GateError("gate: no")
         self._lapses = count % 37 == 0
 
@@ -108,7 +109,8 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     settings = DaemonSettings(cell=cell)
     memory, commands, events = SharedMemory(N, clock=SYSTEM), CommandMemory(), []
     source = TargetSource(SourceContext(SetpointSettings(), N, False, tmp_path, 20.0, SYSTEM))
-    loop = Loop(settings, model, Scripted(1800, commands, model), source, memory, events.append)
+    scripted = Scripted(1800, commands, model)
+    loop = Loop(settings, model, scripted, source, memory, events.append)
     _compile(settings, model, clock=SYSTEM)  # else the first cycles are late
     then = run(loop, memory, commands, tmp_path, "then")
     flags = then["flags"].astype(int)
@@ -119,7 +121,9 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     assert (flags & 4).any()  # gap
     assert (flags & 8).any()  # ramping out
     assert ((flags & 64) > 0).sum() > 10  # after setpoints that have lapsed
-    assert flags[311] & 64, "after the refused one"
+    computed = (then["written"] == 1) | (then["attempted"] == 2)
+    following = scripted.refused_at + 1 + int(np.argmax(computed[scripted.refused_at + 1 :]))
+    assert flags[following] & 64, "after the refused one"
     assert then["written"].sum() > 500
 
     memory, commands = SharedMemory(N, clock=SYSTEM), CommandMemory()
