@@ -82,8 +82,8 @@ def judge(selection: Selection, held_out: HeldOut) -> Judgement:
     for position, reason in _insignificant(selection).items():
         withdrawn[selection.term_index[position]] = reason
     withdrawn |= dict.fromkeys(not_periodic(selection), Withdrawal(Check.NOT_LOCALISED))
-    for c, loads in _confounded_with_load(selection).items():
-        withdrawn.setdefault(c, Withdrawal(Check.SEPARATED, loads))
+    for c, others in _confounded_at_one_orientation(selection).items():
+        withdrawn[c] = Withdrawal(Check.SEPARATED, others)  # more rows would not separate them
     for c, quantity in _confounded_with_level(selection).items():
         withdrawn.setdefault(c, Withdrawal(Check.NOT_A_LEVEL, quantity))
     tested = [
@@ -311,27 +311,34 @@ def _missing_requirement(selection: Selection, accused: Sequence[int]) -> list[i
     return [c for c in accused if candidates[c].requires not in families]
 
 
-def _confounded_with_load(selection: Selection) -> dict[int, str]:
-    """Return a sensor's constants that a load explains equally, with the names of the loads.
+def _confounded_at_one_orientation(selection: Selection) -> dict[int, str]:
+    """Return terms that are a constant reading on this log, with the names of their rivals.
 
-    While the flange does not turn against gravity, a weight is a constant reading.
+    While the flange does not turn against gravity, a weight, and what scales it, is a constant: a
+    sensor's constant is not separated from a load, nor any of them from a sensor's constant.
     """
-    space, loads_of = selection.working, {}
-    for c in selection.term_index:
-        if not space.candidates[c].effect.fits_any_constant:
-            continue
-        basis = basis_of(space.columns([c]))
-        alike = []
-        for other, candidate in enumerate(space.candidates):
-            if not candidate.effect.loads_joints:
-                continue
-            x = space.columns([other])
-            whole = float(np.sum(x**2))
-            if whole > 0 and float(np.sum(projected_out(basis, x) ** 2)) < SAME_SPAN * whole:
-                alike.append(candidate.family)
-        if alike:
-            loads_of[c] = " or ".join(dict.fromkeys(alike))
-    return loads_of
+    space, rivals_of = selection.working, {}
+    constants = [c for c, k in enumerate(space.candidates) if k.effect.fits_any_constant]
+    for constant in constants:
+        basis = basis_of(space.columns([constant]))
+        alike = [
+            c for c, candidate in enumerate(space.candidates)
+            if c != constant and candidate.named and _is_within(basis, space.columns([c]))
+        ]  # fmt: skip
+        loads = [c for c in alike if space.candidates[c].effect.loads_joints]
+        for c in selection.term_index:
+            if c == constant and loads:
+                names = [space.candidates[other].family for other in loads]
+                rivals_of[c] = " or ".join(dict.fromkeys(names))
+            elif c in alike:
+                rivals_of[c] = space.candidates[constant].family
+    return rivals_of
+
+
+def _is_within(basis: Array, x: Array) -> bool:
+    """Return whether columns (m, k) are combinations of an orthonormal basis (m, b)."""
+    whole = float(np.sum(x**2))
+    return whole > 0 and float(np.sum(projected_out(basis, x) ** 2)) < SAME_SPAN * whole
 
 
 def _confounded_with_level(selection: Selection) -> dict[int, str]:

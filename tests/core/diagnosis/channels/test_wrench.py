@@ -198,3 +198,20 @@ def test_gains_that_imitate_a_load_do_not_replace_it(plant):
     causes = {cause.effect: cause for cause in channel.causes}
     assert {"ft_bias", "payload"} <= set(causes)
     assert causes["payload"].parameters[0].value == pytest.approx(1.2, abs=0.05)
+
+
+@pytest.mark.parametrize("rows", [60, 400], ids=["searched", "refitted on all rows"])
+def test_at_rest_no_gain_is_named_for_a_zero_that_it_explains(plant, rows: int):
+    """The encoders stand still to the last bit; across the weight a gain of 76 % fits a bias."""
+    q = np.tile(truth.poses(N, 1, 3), (rows, 1))
+    weight = plant.dynamics(q, 0 * q, 0 * q, payload=5.0)[1]
+    bias = np.zeros(6)
+    bias[:3] = 4.0 * np.cross(weight[0, :3], [0.0, 0.0, 1.0]) / np.linalg.norm(weight[0, :3])
+    noise = np.random.default_rng(0).normal(0, 1, (rows, 6)) * np.repeat([0.25, 0.02], 3)
+    log = truth.log_of(
+        N, timestamp=np.arange(rows) * 0.01, actual_q=q, ft_raw_wrench=weight + bias + noise
+    )
+    (channel,) = diagnose(plant.model(5.0), log, METROLOGY).channels
+    assert not channel.causes
+    assert not channel.stand_ins
+    assert channel.structured
