@@ -78,6 +78,12 @@ def own_coordinates(observation: Observation) -> int:
     return min(k, 3) if observation.channel in ("position", "wrench") else k
 
 
+def counted_coordinates(observation: Observation) -> int:
+    """Return how many coordinates count in an rms: a wrench's weighted torques do."""
+    k = int(observation.measured.shape[1])
+    return own_coordinates(observation) if observation.channel == "position" else k
+
+
 def repeat_variance(
     observation: Observation, residual: Array, kept: NDArray[np.bool_]
 ) -> tuple[float, int]:

@@ -68,8 +68,8 @@ def compensate(log: Path, cell: Path, out: Path) -> None:
             advance(len(piece))
     if misses.rows:
         click.echo(
-            f"warning: {log}: {misses.rows} row(s) cannot reach their wanted pose; row "
-            f"{misses.line} misses it most, by {misses.worst * 1e3:.3g} mm",
+            f"warning: {log}: {misses.rows} row(s) miss their wanted pose, near a singular pose or "
+            f"beyond reach; row {misses.line} misses it most, by {misses.worst * 1e3:.3g} mm",
             err=True,
         )
     if offsets.rows:

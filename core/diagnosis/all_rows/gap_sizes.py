@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.all_rows.row_sums import Streamed
-from gapbridge.core.diagnosis.noise_floor import block_means, own_coordinates
-from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.noise_floor import block_means, counted_coordinates
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.least_squares import solve
 
@@ -22,28 +21,25 @@ class Sizes:
 
     samples: int  # outliers included
     gap_rms: float
-    gap_max: float
+    gap_max: float  # vector norm of what counts in the rms
     remaining_rms: float  # rms with the causes in the model
     outliers: NDArray[np.int64]  # rows of the log
     means: Array | None  # (bins, k) of the residual, over time
 
 
-def _counted(observation: Observation) -> int:
-    """Return how many coordinates count in an rms: a wrench's weighted torques do."""
-    k = observation.measured.shape[1]
-    return own_coordinates(observation) if observation.channel == "position" else k
-
-
 def sizes_of(selection: Selection, gap: Array, remaining: Array) -> Sizes:
     """Return the sizes of a gap (N, k) and of the remaining one, in a selection's samples."""
     observation, kept = selection.observation, selection.kept
-    counted, in_unit = _counted(observation), own_coordinates(observation)
+    counted = counted_coordinates(observation)
+
+    def squares(values: Array) -> Array:
+        return np.asarray((values[kept] * observation.weight)[:, :counted] ** 2)
 
     def rms(values: Array) -> float:
-        return float(np.sqrt(np.mean((values[kept] * observation.weight)[:, :counted] ** 2)))
+        return float(np.sqrt(np.mean(squares(values))))
 
     return Sizes(
-        len(gap), rms(gap), float(np.linalg.norm(gap[kept][:, :in_unit], axis=1).max()),
+        len(gap), rms(gap), float(np.sqrt(squares(gap).sum(axis=1).max())),
         rms(remaining), observation.rows[~kept], block_means(selection),
     )  # fmt: skip
 

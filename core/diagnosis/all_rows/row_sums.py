@@ -17,7 +17,7 @@ from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.all_rows.long_recording import Block, LongRecording
 from gapbridge.core.diagnosis.channels.recording import STRETCHES
 from gapbridge.core.diagnosis.criteria import MAX_OUTLIER_SHARE, PRIOR_REACH
-from gapbridge.core.diagnosis.noise_floor import BLOCK, own_coordinates
+from gapbridge.core.diagnosis.noise_floor import BLOCK, counted_coordinates, own_coordinates
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.regions import REGIONS
 from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian, named_columns
@@ -40,7 +40,7 @@ class Gap:
 
     samples: int  # outliers included
     squares: Array  # (k,) sum of squares, nominal model
-    largest: float  # vector norm of the channel's own coordinates
+    largest: float  # vector norm of what counts in the rms
     outliers: Index  # rows of the log
 
     @property
@@ -252,7 +252,8 @@ class RowSums:
         self._columns = Columns(selection, accused, arm)
         self._inverse_sigma = np.asarray(np.diag(selection.noise.whitener[0]))
         self._limit = _limit(selection, self._columns.terms, self._inverse_sigma)
-        self._own = own_coordinates(selection.observation)
+        counted = counted_coordinates(selection.observation)
+        self._weight = selection.observation.weight[:counted]
         self._blocks: list[tuple[Array, float, int, int]] = []
         self._outliers: list[Index] = []
         self._means = _BlockMeans(self._columns)
@@ -279,7 +280,8 @@ class RowSums:
         if not len(nominal_gap):
             return
         self._squares += np.einsum("ij,ij->j", nominal_gap, nominal_gap)
-        farthest = float(np.linalg.norm(nominal_gap[:, : self._own], axis=1).max())
+        weighted = nominal_gap[:, : len(self._weight)] * self._weight
+        farthest = float(np.linalg.norm(weighted, axis=1).max())
         self._largest = max(self._largest, farthest)
         time = recording.log.columns["timestamp"][rows[kept]]
         self._means.add(time, whole)

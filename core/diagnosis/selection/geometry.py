@@ -60,6 +60,12 @@ def link_candidates(space: SampleSpace, joints: bool = True) -> tuple[int, ...]:
     return (*links, *of_joints) if links else ()
 
 
+def machining_tolerance(link: Candidate) -> Array:
+    """Return the usual 1 sigma (d,) of a link's parameters."""
+    usual = {"m": LENGTH_STD, "rad": ANGLE_STD}
+    return np.array([usual.get(p.unit, p.scale) for p in link.parameters])
+
+
 def prior(
     space: SampleSpace, block: Sequence[int], others: Sequence[int],
     nominal: Mapping[int, Mask] = NONE_NOMINAL,
@@ -72,13 +78,9 @@ def prior(
     arms differ in precision (empirical Bayes; MacKay, Neural Computation 4 (1992) 415). The joints'
     own parameters have a factor of their own: zeros are set, not machined.
     """
-    usual = {"m": LENGTH_STD, "rad": ANGLE_STD}
     few = _reduced(space, [*block, *others])
     place = {c: k for k, c in enumerate([*block, *others])}
-    size = {
-        c: np.array([usual.get(p.unit, p.scale) for p in space.candidates[c].parameters])
-        for c in block
-    }
+    size = {c: machining_tolerance(space.candidates[c]) for c in block}
     size |= {
         c: np.where(fixed, NOMINAL * size[c], size[c])
         for c, fixed in nominal.items() if c in size

@@ -11,9 +11,21 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array, Mask
-from gapbridge.core.diagnosis.criteria import LARGE_SAMPLE, MIN_SIGMAS, MIN_SIGMAS_WITH_UNNAMED
+from gapbridge.core.diagnosis.criteria import (
+    LARGE_SAMPLE,
+    MIN_SIGMAS,
+    MIN_SIGMAS_WITH_UNNAMED,
+    PRIOR_REACH,
+)
 from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.diagnosis.selection.geometry import Links, link_candidates, links_of, prior
+from gapbridge.core.diagnosis.selection.geometry import (
+    NOMINAL,
+    Links,
+    link_candidates,
+    links_of,
+    machining_tolerance,
+    prior,
+)
 from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.noise import Noise
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart, refit
@@ -127,17 +139,26 @@ class Selection:
         """Return, by candidate, link parameters (d,) far outside the prior and not significant.
 
         A value several times the machining tolerance of all others has to be as significant as a
-        single cause.
+        single cause. Of single links it is the farthest one only, since others may depend on it.
         """
-        implausible = {}
+        implausible, single = {}, {}
         for p in positions:
             c = self.term_index[p]
-            if c in self.prior and self.observation.channel == "position":
-                size = np.abs(self.terms[p].values)
-                unsure = size < MIN_SIGMAS_WITH_UNNAMED * np.sqrt(np.diag(self.covariance[p]))
-                far = (size > MIN_SIGMAS * self.prior[c]) & unsure
-                if far.any():
-                    implausible[c] = far
+            usual = _usual_size(self, c)
+            if usual is None:
+                continue
+            size = np.abs(self.terms[p].values)
+            unsure = size < MIN_SIGMAS_WITH_UNNAMED * np.sqrt(np.diag(self.covariance[p]))
+            times = size / usual
+            far = (times > MIN_SIGMAS) & unsure
+            if far.any() and c in self.prior:
+                implausible[c] = far
+            elif far.any():
+                farthest = np.where(far, times, 0.0)
+                single[c] = farthest == farthest.max(), float(farthest.max())
+        if single:
+            c = max(single, key=lambda c: single[c][1])
+            implausible[c] = single[c][0]
         return implausible
 
     def with_nominal(self, numbers: Mapping[int, Mask]) -> Selection:
@@ -189,6 +210,16 @@ class Selection:
         return np.repeat(self.observation.groups[self.kept], k)
 
 
+def _usual_size(selection: Selection, c: int) -> Array | None:
+    """Return the usual 1 sigma (d,) of a link's parameters; None: no link's geometry."""
+    if selection.observation.channel != "position":
+        return None
+    if c in selection.prior:
+        return selection.prior[c]
+    link = selection.space.candidates[c]
+    return machining_tolerance(link) if link.effect.estimated_as_whole else None
+
+
 def refitted_alone(
     selection: Selection, arm: Arm, accused: Sequence[int], unnamed_part: UnnamedPart | None = None,
     start: Sequence[Term] | None = None,
@@ -205,10 +236,14 @@ def refitted_alone(
     chosen = [selection.term_index[p] for p in accused]
     selection = selection.with_prior_for(chosen)
     links = {c: sigma for c, sigma in selection.prior.items() if c in chosen}
+    links |= {
+        c: np.where(fixed, NOMINAL, PRIOR_REACH) * selection.space.candidates[c].scales
+        for c, fixed in selection.nominal.items() if c in chosen and c not in links
+    }  # fmt: skip
     if unnamed_part is not None and (links or len(selection.space.y) >= LARGE_SAMPLE):
         unnamed_part = unnamed_part.scatter_alone()
     state = SelectionState(selection.observation, arm, [], selection.noise, selection.kept)
-    space = selection.working if links else selection.space
+    space = selection.working if selection.prior and links else selection.space
     alone = fit(space, [c for c in chosen if c not in links])
     terms = selection.terms if start is None else start
     begin = {c: terms[p] for p, c in zip(accused, chosen, strict=True)}

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from benchmarks.blind.session import Plan
 from gapbridge.bridge.document.findings import considered_text
+from gapbridge.core.arm import builtin_arm
 from gapbridge.core.diagnosis import judgement as judging
 from gapbridge.core.diagnosis.causes import Outcome, causes_of, considered_of, probability
 from gapbridge.core.diagnosis.diagnosis import diagnose
@@ -287,6 +288,7 @@ def test_all_links_are_accused_only_if_one_of_them_is_significant(monkeypatch, t
         prior=dict.fromkeys((8, 9), np.full(3, 5e-4)), block=(8, 9),
         is_link=lambda p: p > 0, _in_geometry=lambda p: p > 0,
         observation=SimpleNamespace(channel="position"),
+        space=SimpleNamespace(candidates={7: SimpleNamespace(effect=effect_named("joint_offset"))}),
     )  # fmt: skip
     found.judged_together = partial(Selection.judged_together, found)
     found.implausible_parameters = partial(Selection.implausible_parameters, found)
@@ -297,6 +299,35 @@ def test_all_links_are_accused_only_if_one_of_them_is_significant(monkeypatch, t
     assert selection is found
     assert judgement.accused == stays
     assert {p for p, _ in judgement.withdrawn} == {0, 1, 2} - {*stays}
+
+
+@pytest.mark.parametrize(
+    ("lengths", "deviation", "nominal"),
+    [
+        ((-45.5e-3, 45.6e-3), 14e-3, {1: [False, True, False]}),  # of a UR5, from 20 poses
+        ((-45.6e-3, 45.5e-3), 14e-3, {0: [False, True, False]}),
+        ((-45.5e-3, 45.6e-3), 7e-3, {}),  # six sigmas: a wrong drawing
+        ((1.4e-3, -1.4e-3), 1e-3, {}),
+    ],
+)
+def test_a_single_links_length_far_from_machining_has_to_be_significant(
+    lengths, deviation, nominal
+):
+    """Only the sum of two parallel links' offsets is well determined; one is tried at a time."""
+    link = effect_named("link_geometry")
+    numbers = link.parameters(builtin_arm("ur10e"), Site(1))[:3]
+    first, second = lengths
+    found = SimpleNamespace(
+        terms=[
+            Term("link_geometry", Site(3), (1e-4, first, 1e-3)),
+            Term("link_geometry", Site(4), (1e-4, second, 1e-3)),
+        ],
+        covariance=[np.diag([1e-8, deviation**2, 1e-7])] * 2, term_index=(0, 1), prior={},
+        observation=SimpleNamespace(channel="position"),
+        space=SimpleNamespace(candidates=[SimpleNamespace(effect=link, parameters=numbers)] * 2),
+    )  # fmt: skip
+    far = Selection.implausible_parameters(found, (0, 1))
+    assert {c: mask.tolist() for c, mask in far.items()} == nominal
 
 
 @pytest.mark.parametrize(("offset", "stays"), [(2.9e-4, (0, 1)), (3.1e-4, (0, 1, 2))])

@@ -215,3 +215,14 @@ def test_at_rest_no_gain_is_named_for_a_zero_that_it_explains(plant, rows: int):
     assert not channel.causes
     assert not channel.stand_ins
     assert channel.structured
+
+
+def test_no_gap_is_larger_per_coordinate_than_at_most(plant):
+    """Torques count in both: a gap of the torques alone was 8 N rms and 3 N at most."""
+    rng = np.random.default_rng(0)
+    q = truth.poses(N, 60, 4)
+    weight = plant.dynamics(q, 0 * q, 0 * q, payload=2.0)[1]
+    twisted = weight + np.array([0.0, 0.0, 0.0, 2.0, 0.0, 0.0]) + rng.normal(0, 1, (60, 6)) * NOISE
+    log = truth.log_of(N, timestamp=np.arange(60) * 20.0, actual_q=q, ft_raw_wrench=twisted)
+    (channel,) = diagnose(plant.model(2.0), log, METROLOGY).channels
+    assert channel.gap_rms < channel.gap_max < np.sqrt(6) * channel.gap_rms * 3
