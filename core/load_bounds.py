@@ -16,6 +16,8 @@ LEVER = 0.3  # m, of that force, or of the heaviest payload, from the flange
 MASS_SHARE = 0.5  # of the links' mass, as the rated payload where it is unknown
 DEFAULT_RATED = 10.0  # kg, rated payload where the links' masses are unknown too
 GRAVITY = 9.80665  # m/s^2
+MAX_FORCE, MAX_MOMENT = 1e4, 1e4  # N, Nm on a tool: no arm is pushed harder
+WRENCH = (MAX_FORCE,) * 3 + (MAX_MOMENT,) * 3
 
 
 @dataclass(frozen=True)

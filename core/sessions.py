@@ -78,11 +78,15 @@ def join_sessions(logs: Sequence[Log], model: Model) -> Log:
 
     Columns of loads that a session lacks take the model's own values; a channel that a session
     lacks is empty in it; other columns have to be in all. Raises LogError where one of the logs
-    is itself several sessions, or poses at rest stand beside recordings of motion.
+    is itself several sessions or a copy of another, or poses at rest stand beside recordings of
+    motion.
     """
     if len(logs) == 1:
         return with_sessions(logs[0], model)
     names = _names([log.path for log in logs])
+    for first, log in itertools.combinations(logs, 2):
+        if log.same_rows(first):
+            raise LogError(f"{log.path}: found the rows of {first.path}, expected each log once")
     for log in logs:
         if log.has("session") and np.ptp(log.require("session")) > 0:
             raise LogError(

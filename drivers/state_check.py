@@ -9,6 +9,7 @@ import numpy as np
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.errors import Implausible, InvalidStateError
+from gapbridge.core.load_bounds import WRENCH
 from gapbridge.core.state import RobotState
 
 FASTEST = 20.0  # rad/s, of a joint whose URDF gives no velocity limit
@@ -17,13 +18,11 @@ JITTER = 0.01  # rad: noise of one reading
 LIMIT_MARGIN = 0.35  # rad past a joint limit: another arm, another zero, or other units
 LARGEST_ANGLE = 1e4  # rad, of a joint without limits
 TARGET = 20.0  # rad: bound of target_q, unless the joint's own limits are wider
-FORCE, MOMENT = 1e4, 1e4  # N, Nm
 LARGEST: dict[str, float] = {
     "actual_qd": 60.0, "joint_temperatures": 300.0, "actual_current_as_torque": 1e4,
     "payload_cog": 10.0,
 }  # fmt: skip
 """Largest plausible magnitudes of the other vectors of a RobotState, SI units."""
-WRENCH = [FORCE] * 3 + [MOMENT] * 3
 HEAVIEST = 1e3  # kg, of a payload
 LATEST = 1e11  # s, of a clock: 3000 years
 
@@ -43,8 +42,8 @@ class SampleCheck:
         self._bounds: dict[str, tuple[list[float], list[float]]] = {
             "actual_q": (lower.tolist(), upper.tolist()),
             "target_q": (np.minimum(lower, -TARGET).tolist(), np.maximum(upper, TARGET).tolist()),
-            "actual_TCP_force": ([-v for v in WRENCH], WRENCH),
-            "ft_raw_wrench": ([-v for v in WRENCH], WRENCH),
+            "actual_TCP_force": ([-v for v in WRENCH], [*WRENCH]),
+            "ft_raw_wrench": ([-v for v in WRENCH], [*WRENCH]),
         }
         for name, most in LARGEST.items():
             count = 3 if name == "payload_cog" else arm.n

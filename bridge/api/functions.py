@@ -83,16 +83,17 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     """Return the joint flexibilities identified from a log; ``gapbridge fit``.
 
     ``remounted``: the target was taken off between sessions. Raises ExcitationError where nothing
-    in the log excites the compliance.
+    in the log excites the compliance, LogError where its measured poses are another arm's.
     """
     from gapbridge.bridge.api.uncertainty import provenance_of_fit
-    from gapbridge.bridge.cell.log_consistency import pose_findings
+    from gapbridge.bridge.cell.log_consistency import require_own_arm
     from gapbridge.bridge.document.notes import note_texts
     from gapbridge.core.estimation.identification import (
         identify_compliance,  # predict need not wait for it
     )
 
     metrology = replace(cell.metrology, remounted=remounted)
+    warnings = require_own_arm(cell, log, metrology)
     estimate = identify_compliance(cell.model, log, metrology)
     held_out = estimate.remaining_rms_held_out
     return Fitted(
@@ -101,7 +102,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
         std_radial=estimate.std_radial, shown=estimate.identifiable, samples=estimate.samples,
         gap_rms=estimate.gap_rms, remaining_rms=estimate.remaining_rms,
         remaining_rms_held_out=held_out if math.isfinite(held_out) else None,
-        notes=(*pose_findings(cell, log), *note_texts((*estimate.notes, *estimate.combinations))),
+        notes=(*warnings, *note_texts((*estimate.notes, *estimate.combinations))),
         provenance=provenance_of_fit(
             cell, estimate, provenance(_sources(cell, log), "fit", remounted=remounted),
             range_of(log),
@@ -128,6 +129,10 @@ def diagnose(
         effect_named(name)
     files = _sources(cell, log, simulated)
     if simulated is not None:
+        if simulated.same_rows(log):
+            raise LogError(
+                f"{simulated.path}: found the rows of {log.path}, expected a simulator's log"
+            )
         simulated = at_joints_of(log, aligned(simulated, log), cell)
     metrology = replace(cell.metrology, remounted=remounted)
     try:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.document.json_text import finite
 from gapbridge.bridge.document.output_file import (
+    require_cell,
     require_folder,
     require_table,
     require_writable,
@@ -21,6 +22,7 @@ from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.columns import as_table
 from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogFinding
 from gapbridge.core.model import Model
 
 if TYPE_CHECKING:
@@ -147,10 +149,16 @@ class Diagnosed:
         return self._effects("stand_ins")
 
     def save(self, path: Path | str, *, stand_ins: bool = False) -> None:
-        """Write the cell with the causes added, as ``--apply`` (``--stand-ins``) does."""
+        """Write the cell with the causes added, as ``--apply`` (``--stand-ins``) does.
+
+        Raises LogError where the measured poses are another arm's.
+        """
         from gapbridge.bridge.api.uncertainty import cause_entries, intervals_applied, spread_of
+        from gapbridge.bridge.cell.log_consistency import refuse_other_arm
 
         diagnosis, cell = self.diagnosis, self.cell
+        found = (f for f in diagnosis.findings if isinstance(f, LogFinding))
+        refuse_other_arm(self.log, found)
         spread = spread_of(diagnosis).beside(cell.spread)
         origin = fitted(
             self.document["provenance"], range_of(self.log), spread,
@@ -187,5 +195,8 @@ class Diagnosed:
 
 
 def _save(cell: Cell, path: Path | str, model: Model, origin: dict[str, Any]) -> None:
-    """Write a cell. Raises InputError where it cannot be written, or is the one it came from."""
-    save_cell(cell, require_writable(Path(path), cell.path), model, {"provenance": origin})
+    """Write a cell.
+
+    Raises InputError where it cannot be written, is no YAML file, or is the one it came from.
+    """
+    save_cell(cell, require_cell(Path(path), cell.path), model, {"provenance": origin})

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cell.plausibility import Findings
 from gapbridge.bridge.document.log_findings import log_finding_text
+from gapbridge.core.diagnosis.channels.position import session_model
 from gapbridge.core.diagnosis.log_checks.frames import frame_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import findings
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import did_you_mean
 from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogFinding
+from gapbridge.core.metrology import Metrology
 from gapbridge.core.sessions import sessions_in
 
 MEASURED = "measured_position"
@@ -32,7 +36,7 @@ def log_findings(cell: Cell, path: Path) -> Findings:
         )
     log.require("actual_q", "target_q")
     log.loads()
-    errors = pose_findings(cell, log)
+    errors = [log_finding_text(finding) for finding in pose_findings(cell, log)]
     anomalies: dict[str, None] = {}  # in order, without duplicates
     for part in sessions_in(log):
         unit_findings = findings(part, cell.model, cell.metrology)
@@ -43,10 +47,31 @@ def log_findings(cell: Cell, path: Path) -> Findings:
     )
 
 
-def pose_findings(cell: Cell, log: Log) -> list[str]:
-    """Return how measured poses contradict the cell's arm, without duplicates."""
-    texts: dict[str, None] = {}
+def pose_findings(cell: Cell, log: Log, metrology: Metrology | None = None) -> list[LogFinding]:
+    """Return how measured poses contradict the cell's arm, without duplicates.
+
+    ``metrology`` None: the cell's.
+    """
+    metrology = metrology or cell.metrology
+    found: dict[LogFinding, None] = {}
     for part in sessions_in(log):
-        part_findings = frame_findings(cell.model, part, cell.metrology)
-        texts |= dict.fromkeys(log_finding_text(finding) for finding in part_findings)
-    return list(texts)
+        model = session_model(cell.model, part, metrology)
+        found |= dict.fromkeys(frame_findings(model, part, metrology))
+    return list(found)
+
+
+def require_own_arm(cell: Cell, log: Log, metrology: Metrology) -> list[str]:
+    """Return how the measured poses contradict the cell, where a fit holds all the same.
+
+    Raises LogError where nothing that is fitted to them holds.
+    """
+    found = pose_findings(cell, log, metrology)
+    refuse_other_arm(log, found)
+    return [log_finding_text(finding) for finding in found]
+
+
+def refuse_other_arm(log: Log, findings: Iterable[LogFinding]) -> None:
+    """Raise LogError for a finding by which nothing that is fitted to the log's poses holds."""
+    for finding in findings:
+        if finding.forbids_fit:
+            raise LogError(f"{log.path}: {log_finding_text(finding)}; nothing is written")

@@ -13,7 +13,7 @@ from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
 from gapbridge.core.errors import LogError, LogOptionError
-from gapbridge.core.load_bounds import PAYLOAD_FACTOR
+from gapbridge.core.load_bounds import PAYLOAD_FACTOR, WRENCH
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.sources import SourceOptions, source_of
 from gapbridge.core.notes import Note
@@ -72,12 +72,13 @@ def joint_names(cell: Cell) -> tuple[str, ...]:
 
 
 def check_log(log: Log, cell: Cell) -> None:
-    """Raise LogError if joint angles, units or payloads of a log are impossible for the arm."""
+    """Raise LogError if joint angles, units or loads of a log are impossible for the arm."""
     log.check_size()
     for name in ("actual_q", "target_q"):
         if np.isinf(log.columns.get(name, np.zeros(0))).any():
             log.require(name)  # names the cell
     check_units(cell.model, log)
+    log.check_within("actual_TCP_force", np.array(WRENCH), "N or Nm")
     mass, rated = log.get("payload"), cell.arm.payload
     if mass is not None and (mass > PAYLOAD_FACTOR * rated).any():
         row = int(np.argmax(mass > PAYLOAD_FACTOR * rated))

@@ -16,6 +16,7 @@ from gapbridge.core.errors import InputError
 if TYPE_CHECKING:
     from gapbridge.bridge.cell import Cell
     from gapbridge.core.log.log import Log
+    from gapbridge.core.log.log_finding import LogFinding
 
 FILE = click.Path(path_type=Path)
 log_argument = click.argument("log", type=FILE)
@@ -56,15 +57,32 @@ def open_cell(path: Path) -> Cell:
     return cell
 
 
-def open_logs(paths: Sequence[Path], cell: Cell) -> Log:
+def open_logs(paths: Sequence[Path], cell: Cell, *, warn: bool) -> Log:
     """Return several logs as the sessions of one; a single log is returned as it is.
 
-    Raises LogError as ``open_log`` does, and if the sessions are inconsistent.
+    ``warn``: with the warnings of ``with_log_warnings`` on each. Raises LogError as ``open_log``
+    does, and if the sessions are inconsistent.
     """
     from gapbridge.bridge.cell.opened_log import open_log
     from gapbridge.core.sessions import join_sessions
 
-    return join_sessions([open_log(path, cell) for path in paths], cell.model)
+    logs = [open_log(path, cell) for path in paths]
+    for log in logs if warn else ():
+        for _ in with_log_warnings([log]):
+            pass
+    return join_sessions(logs, cell.model)
+
+
+def with_log_warnings(pieces: Iterable[Log]) -> Iterator[Log]:
+    """Yield the pieces of a log, then print what it misspells and whether its rows lack order."""
+    from gapbridge.core.diagnosis.log_checks.units_and_clocks import ColumnsAndOrder
+
+    checked, path = ColumnsAndOrder(), ""
+    for piece in pieces:
+        checked.add(piece)
+        path = piece.path
+        yield piece
+    _print_warnings(path, checked.findings())
 
 
 def warn_outside(log: Log, cell: Cell) -> None:
@@ -78,7 +96,6 @@ def warn_outside(log: Log, cell: Cell) -> None:
 
 def with_range_warning(pieces: Iterable[Log], cell: Cell) -> Iterator[Log]:
     """Yield the pieces of a log, then print the warnings of ``warn_outside`` for all of them."""
-    from gapbridge.bridge.document.log_findings import log_finding_text
     from gapbridge.core.fitted_range import Outside
 
     outside, path = Outside(cell.fitted_range), ""
@@ -86,5 +103,11 @@ def with_range_warning(pieces: Iterable[Log], cell: Cell) -> Iterator[Log]:
         outside.add(piece)
         path = piece.path
         yield piece
-    for finding in outside.findings():
+    _print_warnings(path, outside.findings())
+
+
+def _print_warnings(path: str, findings: Iterable[LogFinding]) -> None:
+    from gapbridge.bridge.document.log_findings import log_finding_text
+
+    for finding in findings:
         click.echo(f"warning: {path}: {log_finding_text(finding)}", err=True)

@@ -22,7 +22,8 @@ TEXTS = {
     LogCheck.AMBIGUOUS_TIME: "row {0}, column timestamp: found {1:g} again (as in {2} of {3} "
     "rows), expected a different time in each row",
     LogCheck.REPEATED_TIME: "{0} timestamp(s) are repeated",
-    LogCheck.BACKWARD_TIME: "{0} timestamp(s) run backwards: rows should be in time order",
+    LogCheck.BACKWARD_TIME: "{0} timestamp(s) run backwards (the first is row {1}): rows should be "
+    "in time order",
     LogCheck.NO_READING: "{0} row(s) have no {1:reading} and were left out",
     LogCheck.POSITIONS_AT_REST: "the measured positions hardly change: is it the right column?",
     LogCheck.FAHRENHEIT: "the joint temperatures look like Fahrenheit, expected °C",

@@ -22,6 +22,7 @@ from gapbridge.core.errors import InputError, RunError
 from gapbridge.core.log.columns import PARQUET
 
 CSV = ".csv"
+YAML = (".yaml", ".yml")
 LONG = 50_000  # numbers from which pyarrow writes a table as text: ten times as fast
 MODE = 0o640  # of a new file
 FOLDER_MODE = 0o750  # of a new folder of recordings, sessions and the like
@@ -59,6 +60,23 @@ def require_table(path: Path, *inputs: Path) -> Path:
     if path.suffix.lower() not in (CSV, *PARQUET):
         found = path.suffix or "no suffix"
         raise InputError(f"--out {path}: found {found}, expected .csv or .parquet")
+    return path
+
+
+def require_cell(path: Path, *others: Path) -> Path:
+    """Return the path if a cell can be written there; see ``require_writable``.
+
+    Raises InputError also where its suffix is not that of YAML: a log or a report named by mistake
+    would be lost.
+    """
+    return require_suffix(require_writable(path, *others), YAML)
+
+
+def require_suffix(path: Path, suffixes: Sequence[str]) -> Path:
+    """Return the path if it ends in one of the suffixes. Raises InputError."""
+    if path.suffix.lower() not in suffixes:
+        found = path.suffix or "no suffix"
+        raise InputError(f"{path}: found {found}, expected {' or '.join(suffixes)}")
     return path
 
 

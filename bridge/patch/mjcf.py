@@ -39,6 +39,7 @@ class Mjcf(ModelFormat):
     """MuJoCo's XML."""
 
     suffixes = (".xml", ".mjcf")
+    text_suffixes = suffixes
     holds_load = True
 
     def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,

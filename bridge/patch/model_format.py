@@ -38,6 +38,7 @@ class ModelFormat(ABC):
     """One format of models."""
 
     suffixes: ClassVar[tuple[str, ...]]
+    text_suffixes: ClassVar[tuple[str, ...]]  # of those: the ones of a patched model, a text
     holds_load: ClassVar[bool] = False  # whether a body of it can be named as the payload
 
     @abstractmethod

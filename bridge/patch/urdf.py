@@ -39,6 +39,7 @@ class Urdf(ModelFormat):
     """The Unified Robot Description Format."""
 
     suffixes = (".urdf",)
+    text_suffixes = suffixes
 
     def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,
               notes: Sequence[str]) -> Patched:  # fmt: skip

@@ -46,6 +46,7 @@ class Usd(ModelFormat):
     """Universal Scene Description, with UsdPhysics joints."""
 
     suffixes = (".usd", ".usda", ".usdc", ".usdz")
+    text_suffixes = (".usda", ".usd")
 
     def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,
               notes: Sequence[str]) -> Patched:  # fmt: skip

@@ -170,9 +170,9 @@ def _diagnose(
         samples = _samples(observe, model, log, metrology, sampled)
         if isinstance(samples, NotObservable):
             not_observable.append(samples)
-        elif _too_few_samples(samples[0]):
+        elif needed := _missing_samples(samples[0]):
             reported.append(ChannelFinding(name, TooFewRows(len(samples[0].rows))))
-            not_observable.append(NotObservable(name, ("more rows",)))
+            not_observable.append(NotObservable(name, (needed,)))
         elif sampled is None:
             searched = _search_and_refit(*samples, model, withhold, progress)
             channels.append(_channel_diagnosis(searched, model, None))
@@ -292,10 +292,16 @@ def _gap_unexplained(channel: ChannelDiagnosis) -> bool:
     )
 
 
-def _too_few_samples(observation: Observation) -> bool:
-    """Return whether there are too few samples for a diagnosis."""
+def _missing_samples(observation: Observation) -> str:
+    """Return which samples a diagnosis needs beyond these; empty if they are enough."""
     N, k, p = observation.nuisance.shape
-    return N * k < p + MIN_FREEDOM or len(np.unique(observation.groups)) < MIN_CONDITIONS
+    least, groups = max(-(-(p + MIN_FREEDOM) // k), MIN_CONDITIONS), len(set(observation.groups))
+    if least > N:
+        return f"at least {least} rows (found {N})"
+    what = "poses" if observation.channel == "position" else "stretches of a recording"
+    return "" if groups >= MIN_CONDITIONS else (
+        f"at least {MIN_CONDITIONS} different {what} (found {groups} in {N} rows)"
+    )  # fmt: skip
 
 
 def _search(

@@ -106,6 +106,16 @@ class Log:
             wrong = (np.abs(values) > LARGEST) & np.isfinite(values)
             self._refuse(name, wrong, f"at most {LARGEST:g}")
 
+    def check_within(self, name: str, most: Array, unit: str) -> None:
+        """Raise LogError, naming row and column, for a finite number beyond ``most`` (k,).
+
+        A log without the column (group) ``name`` passes.
+        """
+        values = self.columns.get(name)
+        if values is not None:
+            wrong = (np.abs(values) > most) & np.isfinite(values)
+            self._refuse(name, wrong, f"at most {np.max(most):g} {unit}")
+
     def _refuse(self, name: str, wrong: Mask, expected: str) -> None:
         """Raise LogError for the first cell of a column (group) that is ``wrong``."""
         if not wrong.any():
@@ -113,9 +123,10 @@ class Log:
         flat = self.columns[name].reshape(len(self), -1)
         row, column = (int(v) for v in np.argwhere(wrong.reshape(flat.shape))[0])
         label = name if wrong.ndim == 1 else f"{name}_{column}"
+        value = flat[row, column]
+        found = "nothing" if np.isnan(value) else value  # NaN: an empty cell
         raise LogError(
-            f"{self.path}: row {self.line(row)}, column {label}: found "
-            f"{flat[row, column]}, expected {expected}"
+            f"{self.path}: row {self.line(row)}, column {label}: found {found}, expected {expected}"
         )
 
     def loads(self, motions: bool = True) -> Loads:
@@ -158,6 +169,13 @@ class Log:
         if q is None:
             return None
         return last_motion(q)
+
+    def same_rows(self, other: Log) -> bool:
+        """Return whether both logs hold the same columns with the same numbers: a copy."""
+        return self.columns.keys() == other.columns.keys() and all(
+            np.array_equal(values, other.columns[name], equal_nan=True)
+            for name, values in self.columns.items()
+        )
 
     def select(self, rows: NDArray[Any] | slice) -> Log:
         """Return the log of some of the rows; each keeps the line that it had in the file."""

@@ -17,7 +17,7 @@ class LogCheck(Enum):
     ROUNDED_TIME = auto()  # grain (s), rows that repeat, line of the first
     AMBIGUOUS_TIME = auto()  # line of the first, its time (s), rows that repeat, all rows
     REPEATED_TIME = auto()  # rows
-    BACKWARD_TIME = auto()  # rows
+    BACKWARD_TIME = auto()  # rows, line of the first
     NO_READING = auto()  # rows, column
     POSITIONS_AT_REST = auto()
     FAHRENHEIT = auto()
@@ -67,6 +67,12 @@ OTHER_ARM_CHECKS = (
 )  # fmt: skip
 """The measured poses are not those of the cell's arm: nothing that is fitted to them holds."""
 
+TOOL_CHECKS = (
+    LogCheck.FLANGE_NOT_TCP, LogCheck.TCP_SIGN, LogCheck.NO_TCP, LogCheck.OTHER_TCP,
+    LogCheck.TARGET_AXES,
+)  # fmt: skip
+"""The target is at another place of the tool: a fit and a diagnosis estimate it."""
+
 Value = Union[str, int, float, "LogFinding", tuple["Value", ...]]
 
 
@@ -77,3 +83,10 @@ class LogFinding:
     check: LogCheck
     values: tuple[Value, ...] = ()
     sessions: tuple[str, ...] = ()
+
+    @property
+    def forbids_fit(self) -> bool:
+        """Return whether nothing fitted to the measured poses holds: they are another arm's."""
+        causes = [value for value in self.values if isinstance(value, LogFinding)]
+        checks = [cause.check for cause in causes] or [self.check]
+        return self.check in OTHER_ARM_CHECKS and not any(c in TOOL_CHECKS for c in checks)

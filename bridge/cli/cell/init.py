@@ -21,7 +21,7 @@ from gapbridge.bridge.cell.message import validation_errors
 from gapbridge.bridge.cell.schema import CellFile
 from gapbridge.bridge.cell.sections import LinkSettings
 from gapbridge.bridge.cli.options import FILE
-from gapbridge.bridge.document.output_file import require_writable, write_text
+from gapbridge.bridge.document.output_file import require_cell, write_text
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import GapbridgeError, Implausible, InputError, InvalidStateError
 from gapbridge.core.model import Model
@@ -79,7 +79,7 @@ def init(
 
     Example: gapbridge init 192.168.0.10 --out cell.yaml
     """
-    require_writable(out)
+    require_cell(out)
     if out.exists():
         raise InputError(f"{out}: found a file that is already there, expected a new one")
     arm_options = ArmOptions(**arm)

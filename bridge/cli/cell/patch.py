@@ -10,7 +10,7 @@ import click
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.schema import CauseEntry
 from gapbridge.bridge.cli.options import FILE, cell_option, open_cell
-from gapbridge.bridge.document.output_file import require_writable, write_text
+from gapbridge.bridge.document.output_file import require_suffix, require_writable, write_text
 from gapbridge.bridge.patch.model_format import PatchOptions
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.errors import InputError
@@ -59,7 +59,7 @@ def patch(
     if load and not kind.holds_load:
         raise InputError(f"--load: found with {model}, expected an MJCF (.xml)")
     opened = open_cell(cell)
-    require_writable(out, model, cell)
+    require_suffix(require_writable(out, model, cell), kind.text_suffixes)
     options = _options(opened, out, joints, tcp, load)
     bounds = None
     if parameters is not None:

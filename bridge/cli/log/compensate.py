@@ -15,6 +15,7 @@ from gapbridge.bridge.cli.options import (
     csv_option,
     log_argument,
     open_cell,
+    with_log_warnings,
     with_range_warning,
 )
 from gapbridge.bridge.cli.progress import progress
@@ -59,7 +60,8 @@ def compensate(log: Path, cell: Path, out: Path) -> None:
     names = [f"corrected_q_{i}" for i in range(opened.arm.n)]
     rows, misses, offsets = 0, Exceeded(MAX_RESIDUAL), Exceeded(opened.limits.joint_offset)
     with writing_table(out) as append, progress("correcting") as advance:
-        for piece in with_range_warning(pieces_of(log, opened), opened):
+        pieces = with_log_warnings(pieces_of(log, opened))
+        for piece in with_range_warning(pieces, opened):
             corrected = compensate_log(opened, piece)
             append(names, corrected.q)
             misses.take(piece, corrected.residual)

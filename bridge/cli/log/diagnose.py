@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from gapbridge.bridge import api
+from gapbridge.bridge.cell.log_consistency import require_own_arm
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text, wrong_arm_findings
 from gapbridge.bridge.cli.options import (
@@ -23,7 +24,7 @@ from gapbridge.bridge.cli.options import (
 )
 from gapbridge.bridge.cli.progress import status
 from gapbridge.bridge.document.log_findings import log_finding_text
-from gapbridge.bridge.document.output_file import require_folder, require_writable
+from gapbridge.bridge.document.output_file import require_cell, require_folder, require_writable
 from gapbridge.core.errors import InputError
 
 
@@ -89,9 +90,12 @@ def diagnose(
     if output.stand_ins and output.new_cell is None:
         raise InputError("--stand-ins: found no --apply, expected the cell to write")
     opened = open_cell(cell)
-    rows = open_logs(logs, opened)
+    # joined, they hide what one of them misspells; of a single log the diagnosis reports it
+    rows = open_logs(logs, opened, warn=len(logs) > 1)
     warn_outside(rows, opened)
     require_effects(withhold)
+    if output.new_cell is not None:  # before the work
+        require_own_arm(opened, rows, replace(opened.metrology, remounted=remounted))
     simulated = None if sim is None else open_log(sim, opened)
     output.require_writable(*logs, cell, *([sim] if sim else []))
     with status("diagnosing") as emit:
@@ -122,9 +126,10 @@ class _Output:
     def require_writable(self, *inputs: Path) -> None:
         """Create the folder; raise InputError if a file is not writable, or is an input."""
         named = [] if self.out is None else [self.out / name for name in REPORT_FILES]
-        for file in (self.json_file, self.new_cell):
-            if file is not None:
-                named.append(require_writable(file, *inputs, *named))
+        if self.json_file is not None:
+            named.append(require_writable(self.json_file, *inputs, *named))
+        if self.new_cell is not None:
+            require_cell(self.new_cell, *inputs, *named)
         if self.out is not None:
             require_folder(self.out, "--out", above=False)
 

@@ -9,7 +9,7 @@ import click
 
 from gapbridge.bridge.cli.options import FILE
 from gapbridge.bridge.document.notes import note_texts
-from gapbridge.bridge.document.output_file import require_table, require_writable, write_text
+from gapbridge.bridge.document.output_file import require_cell, require_table, write_text
 from gapbridge.bridge.recording.export import Exported, Span, export, moment
 from gapbridge.core.errors import InputError
 from gapbridge.core.log.mcap_reading import SUFFIX, damages, files_of, read_configuration
@@ -44,7 +44,7 @@ def export_recording(
     require_table(out, *files)
     span = Span(_moment("--from", start), _moment("--to", stop))
     if cell_out is not None:
-        require_writable(cell_out, *files, out)
+        require_cell(cell_out, *files, out)
     for note in note_texts(damages(recording)):
         click.echo(f"warning: {note}", err=True)
     _emit(out, export(recording, out, span))

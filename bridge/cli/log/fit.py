@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from rich.table import Table
 
 from gapbridge.bridge.api.uncertainty import provenance_of_fit
 from gapbridge.bridge.cell import Cell, save_cell
-from gapbridge.bridge.cell.log_consistency import pose_findings
+from gapbridge.bridge.cell.log_consistency import require_own_arm
 from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
 from gapbridge.bridge.cli.options import (
     FILE,
@@ -22,10 +22,11 @@ from gapbridge.bridge.cli.options import (
     open_cell,
     open_logs,
     remounted_option,
+    with_log_warnings,
 )
 from gapbridge.bridge.cli.progress import progress, status
 from gapbridge.bridge.document.notes import note_texts
-from gapbridge.bridge.document.output_file import require_writable
+from gapbridge.bridge.document.output_file import require_cell
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import ExcitationError
@@ -34,6 +35,8 @@ from gapbridge.core.estimation.streamed import identify_streamed
 from gapbridge.core.fitted_range import merged, range_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
+
+SHOWN = 1e-7  # m: the last digit of a printed gap
 
 
 @click.command()
@@ -61,7 +64,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
     """
     opened = open_cell(cell)
-    require_writable(out, *logs, cell)
+    require_cell(out, *logs, cell)
     metrology = replace(opened.metrology, remounted=remounted)
     try:
         estimate, warnings, ranges = _identified(logs, opened, metrology)
@@ -70,6 +73,11 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     origin = provenance({"log": logs, "cell": [cell]})
     origin = provenance_of_fit(opened, estimate, origin, ranges)
     save_cell(opened, out, estimate.cell_model, {"provenance": origin})
+    if estimate.remaining_rms - estimate.gap_rms > SHOWN:
+        warnings.append(
+            "the fit does not reduce the gap: the log does not show that these flexibilities are "
+            "better than the cell's"
+        )
     for line in warnings:
         click.echo(f"warning: {', '.join(map(str, logs))}: {line}", err=True)
     print_identification(estimate)
@@ -92,19 +100,21 @@ def _identified(
         warnings: list[str] = []
 
         def read_once() -> Iterator[Log]:
-            for piece in LargeLog(paths[0], cell, by_approach(cell.model.terms)):
+            pieces: Iterable[Log] = LargeLog(paths[0], cell, by_approach(cell.model.terms))
+            for piece in pieces if ranges else with_log_warnings(pieces):
                 if not ranges:
-                    warnings.extend(pose_findings(cell, piece))
+                    warnings.extend(require_own_arm(cell, piece, metrology))
                 ranges.append(range_of(piece))
                 yield piece
 
         with status("fitting") as emit:
             estimate = identify_streamed(cell.model, read_once(), metrology, progress=emit)
         return estimate, warnings, merged(ranges)
-    rows = open_logs(paths, cell)
+    rows = open_logs(paths, cell, warn=True)
+    warnings = require_own_arm(cell, rows, metrology)
     with progress("fitting"):
         estimate = identify_compliance(cell.model, rows, metrology)
-    return estimate, pose_findings(cell, rows), range_of(rows)
+    return estimate, warnings, range_of(rows)
 
 
 def print_identification(estimate: Identification) -> None:

@@ -19,6 +19,7 @@ from gapbridge.bridge.cli.options import (
     csv_option,
     log_argument,
     open_cell,
+    with_log_warnings,
     with_range_warning,
 )
 from gapbridge.bridge.cli.progress import progress
@@ -69,7 +70,7 @@ def predict(log: Path, cell: Path, out: Path, channels: bool) -> None:
 
 def _predicted_pieces(cell: Cell, log: Path, channels: bool) -> Iterator[tuple[Log, Predicted]]:
     """Yield the pieces of a log with their predictions."""
-    pieces = with_range_warning(pieces_of(log, cell), cell)
+    pieces = with_range_warning(with_log_warnings(pieces_of(log, cell)), cell)
     if not channels:
         yield from ((piece, predict_log(cell, piece)) for piece in pieces)
         return

@@ -10,7 +10,7 @@ import click
 from gapbridge.bridge.calibration.instruments import instrument_settings
 from gapbridge.bridge.calibration.session.prompt import COMMANDS, ENTER, HELP
 from gapbridge.bridge.cli.options import FILE, cell_argument, open_cell
-from gapbridge.bridge.document.output_file import require_writable
+from gapbridge.bridge.document.output_file import require_cell
 
 EPILOG = "\b\nAt every question:\n" + "\n".join(
     f"  {name:<8}{text}" for name, text in [("Enter", ENTER), *COMMANDS.items(), ("?", HELP)]
@@ -95,7 +95,7 @@ def calibrate(
     if folder is not None and folder.exists() and not folder.is_dir():
         raise click.UsageError(f"{folder}: found a file, expected a folder for --session")
     if new_cell is not None:
-        require_writable(new_cell, cell)
+        require_cell(new_cell, cell)
     chosen = instrument_settings(opened, instrument)
     from gapbridge.bridge.calibration.options import SessionOptions
     from gapbridge.bridge.calibration.run import run_session  # imports the numerical libraries

@@ -158,6 +158,38 @@ def findings(
     return listed + sign_findings(model, log)
 
 
+class ColumnsAndOrder:
+    """Findings on a log given in pieces: misspelt columns, and rows that are not in time order.
+
+    Both change loads and last motions without an error. The clock may restart at a new session.
+    """
+
+    def __init__(self) -> None:
+        self._misspelt: list[LogFinding] = []
+        self._backward: list[int] = []  # lines
+        self._last: Array | None = None  # (1, 2) session and time of the last row
+
+    def add(self, log: Log) -> None:
+        """Check one more piece."""
+        self._misspelt = _names(log)
+        time = log.get("timestamp")
+        if time is None:
+            return
+        session = log.get("session")
+        rows = np.column_stack([np.zeros(len(time)) if session is None else session, time])
+        known = rows if self._last is None else np.vstack([self._last, rows])
+        step, first = np.diff(known, axis=0), len(rows) - len(known) + 1
+        back = np.flatnonzero((step[:, 0] == 0) & (step[:, 1] < 0)) + first
+        self._backward += [log.line(row) for row in back]
+        self._last = rows[-1:]
+
+    def findings(self) -> list[LogFinding]:
+        """Return the findings on all pieces."""
+        values = (len(self._backward), *self._backward[:1])
+        backward = [LogFinding(LogCheck.BACKWARD_TIME, values)] if self._backward else []
+        return self._misspelt + backward
+
+
 def _names(log: Log) -> list[LogFinding]:
     """Return unknown columns whose name is similar to a known one."""
     absent = [name for name in COLUMNS if not log.has(name)]
@@ -172,9 +204,13 @@ def _times(log: Log) -> list[LogFinding]:
     moving = time_finding(log)
     if moving is not None:
         return [moving]
-    repeated, back = int(np.sum(np.diff(t) == 0)), int(np.sum(np.diff(t) < 0))
-    counts = ((LogCheck.REPEATED_TIME, repeated), (LogCheck.BACKWARD_TIME, back))
-    return [LogFinding(check, (count,)) for check, count in counts if count]
+    listed, repeated = [], int(np.sum(np.diff(t) == 0))
+    if repeated:
+        listed.append(LogFinding(LogCheck.REPEATED_TIME, (repeated,)))
+    back = np.flatnonzero(np.diff(t) < 0)
+    if len(back):
+        listed.append(LogFinding(LogCheck.BACKWARD_TIME, (len(back), log.line(back[0] + 1))))
+    return listed
 
 
 def _gaps(log: Log) -> list[LogFinding]:

@@ -320,13 +320,13 @@ BAD_Q2 = "0,0,0,0.1,0.1,{},0.1,0.1,0.1"
         (f"{Q1.replace(',actual_q_3', '')}\n0,0,0,0,0,0,0,0\n", ["actual_q_3", "not found"]),
         (f"{Q1},actual_q_6\n{ROW},0\n", ["actual_q_6", "6-joint arm"]),
         (f"{Q1}\n{ROW}\n{ROW},7\n", ["row 3", "10 cells", "expected 9"]),
-        (f"{Q1}\n{ROW}\n{BAD_Q2.format('nan')}\n", ["row 3", "actual_q_2", "nan"]),
+        (f"{Q1}\n{ROW}\n{BAD_Q2.format('nan')}\n", ["row 3", "actual_q_2", "found nothing"]),
         (f"{Q1}\n{ROW}\n{BAD_Q2.format('x')}\n", ["row 3", "actual_q_2", "'x'"]),
         (f"{Q1}\n{BAD_Q2.format('inf')}\n", ["row 2", "actual_q_2", "inf"]),
         (f"{Q1}\n{ROW}\n1e300,{ROW[4:]}\n", ["row 3", "measured_position_0", "1e+300"]),
         (f"{Q1},payload\n{ROW},-1\n", ["row 2", "payload", "-1"]),
         (f"{Q1},payload\n{ROW},1\n{ROW},400\n", ["row 3", "400 kg", "out of range", "12.5 kg"]),
-        (f"{Q1},payload\n{ROW},nan\n", ["row 2", "payload", "nan"]),
+        (f"{Q1},payload\n{ROW},nan\n", ["row 2", "payload", "found nothing"]),
         (f"{Q1},payload_cog_0\n{ROW},0\n", ["payload_cog_1", "not found"]),
     ],
 )
@@ -335,20 +335,22 @@ def test_an_unusable_log_is_refused_in_one_line(
     desk: Desk, command: str, log: str, given: list[str]
 ) -> None:
     desk.write("log.csv", log)
-    line = desk.refuses(command, "@log.csv", "--cell", "@cell.yaml", "--out", "@out.csv")
+    out = "out.yaml" if command == "fit" else "out.csv"
+    line = desk.refuses(command, "@log.csv", "--cell", "@cell.yaml", "--out", f"@{out}")
     for word in given:
         assert word in line
-    assert not (desk.folder / "out.csv").exists()
+    assert not (desk.folder / out).exists()
 
 
 @pytest.mark.parametrize("command", ["predict", "compensate", "fit"])
 def test_unusable_paths_are_refused_in_one_line(desk: Desk, command: str) -> None:
     desk.write("log.csv", f"{Q1}\n{ROW}\n")
     os.mkfifo(desk.folder / "pipe")  # as /dev/null is: root could rename a file over it
+    out = "@o.yaml" if command == "fit" else "@o.csv"
     for given, reported in (
-        (("@none.csv", "--cell", "@cell.yaml", "--out", "@o.csv"), "none.csv: file not found"),
-        (("@log.csv", "--cell", "@none.yaml", "--out", "@o.csv"), "none.yaml: file not found"),
-        (("@pipe", "--cell", "@cell.yaml", "--out", "@o.csv"), "pipe: found a device or pipe"),
+        (("@none.csv", "--cell", "@cell.yaml", "--out", out), "none.csv: file not found"),
+        (("@log.csv", "--cell", "@none.yaml", "--out", out), "none.yaml: file not found"),
+        (("@pipe", "--cell", "@cell.yaml", "--out", out), "pipe: found a device or pipe"),
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@none/o.csv"), "found no folder"),
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@log.csv"), "output to be the input"),
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@cell.yaml"), "output to be the input"),

@@ -158,11 +158,14 @@ def test_unusable_options_are_refused_before_any_work(
         assert word in line
 
 
+OUTPUT = {"predict": "csv", "fit": "yaml"}
+
+
 @pytest.mark.parametrize("name", ["diagnose", "predict", "fit"])
 def test_degrees_are_called_degrees(tmp_path: Path, name: str) -> None:
     q, loads = poses_and_loads(30)
     columns = columns_of(np.degrees(q), loads) | measured(SOFT, q, loads)
-    more = () if name == "diagnose" else ("--out", tmp_path / "o.csv")
+    more = () if name == "diagnose" else ("--out", tmp_path / f"o.{OUTPUT[name]}")
     line = refused(name, log_in(tmp_path, columns), "--cell", cell_in(tmp_path), *more)
     assert "log.csv" in line
     assert "look like degrees, expected rad" in line
@@ -218,8 +221,8 @@ def hole(column: Array) -> Array:
 
 
 SPOILT: dict[str, tuple[str, Callable[[Array], Array], list[str]]] = {
-    "an angle that is no number": ("actual_q", hole, ["row 7, column actual_q_0", "found nan"]),
-    "a payload that is no number": ("payload", hole, ["row 7, column payload", "found nan"]),
+    "an angle that is no number": ("actual_q", hole, ["row 7, column actual_q_0", "found nothing"]),
+    "a payload that is no number": ("payload", hole, ["row 7, column payload", "found nothing"]),
     "an endless force": (
         "actual_TCP_force", lambda v: hole(v) * np.inf, ["actual_TCP_force_0", "finite"],
     ),
@@ -259,9 +262,9 @@ def test_unusable_values_are_refused_by_name(tmp_path: Path, mistake: str) -> No
 
 def test_a_load_under_which_the_arm_would_buckle_is_refused_by_its_row(tmp_path: Path) -> None:
     table = full_table()
-    table["actual_TCP_force_2"] = np.where(np.arange(40) == 16, 1e9, 0.0)
+    table["actual_TCP_force_2"] = np.where(np.arange(40) == 16, 9e3, 0.0)
     table |= {f"actual_TCP_force_{i}": np.zeros(40) for i in (0, 1, 3, 4, 5)}
-    cell = cell_in(tmp_path, CELL + "compliance: {axial: [1.0e-5, 1.0e-5, 1.0e-5, 0, 0, 0]}\n")
+    cell = cell_in(tmp_path, CELL + "compliance: {axial: [3.0e-4, 3.0e-4, 3.0e-4, 0, 0, 0]}\n")
     line = refused("diagnose", log_in(tmp_path, table), "--cell", cell)
     assert "log.csv: row 17: the arm finds no equilibrium" in line
 
@@ -330,4 +333,8 @@ def test_five_poses_for_forty_parameters_end_without_a_traceback(tmp_path: Path)
     assert (answer.code, answer.err) == (0, "")
     assert "over 5 samples" in answer.out
     few = {k: v[:3] for k, v in table.items()}
-    assert "more rows" in refused("diagnose", log_in(tmp_path, few), "--cell", cell)
+    line = refused("diagnose", log_in(tmp_path, few), "--cell", cell)
+    assert "position: at least 4 rows (found 3)" in line
+    same = {k: np.repeat(v[:1], 30) for k, v in table.items()}
+    line = refused("diagnose", log_in(tmp_path, same), "--cell", cell)
+    assert "position: at least 4 different poses (found 1 in 30 rows)" in line

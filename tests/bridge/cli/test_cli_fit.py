@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 from cli_runs import (
     AXIAL,
     CELL,
@@ -18,6 +19,7 @@ from cli_runs import (
     measured,
     names,
     poses_and_loads,
+    refused,
     table_of,
 )
 
@@ -128,3 +130,83 @@ def test_a_fit_takes_no_target_beside_the_tcp_for_it_writes_no_frame_and_exact_z
         0
     ]
     assert float(after) < 0.03 < 0.1 < float(before)  # mm
+
+
+OUTPUTS = {
+    "fit": ("--out", "new.yaml"), "predict": ("--out", "p.csv"), "compensate": ("--out", "c.csv"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("command", OUTPUTS)
+def test_columns_and_rows_that_change_the_loads_silently_are_warned_of(
+    tmp_path: Path, command: str
+) -> None:
+    q, loads = poses_and_loads(40)
+    columns = columns_of(q, loads) | measured(bent_model(), q, loads, noise=2e-5)
+    columns["timestamp"] = np.where(np.arange(40) == 6, 0.0, np.arange(40.0))
+    columns["session"] = np.zeros(40)
+    columns = {k.replace("payload", "paylod"): v for k, v in columns.items()}
+    option, name = OUTPUTS[command]
+    log = log_in(tmp_path, columns)
+    answer = gapbridge(command, log, "--cell", cell_in(tmp_path), option, tmp_path / name)
+    assert answer.code == 0, answer.err
+    for words in (
+        "a column was left out; found paylod; did you mean payload?",
+        "a column was left out; found paylod_cog_0; did you mean payload_cog_0?",
+        "1 timestamp(s) run backwards (the first is row 8): rows should be in time order",
+    ):
+        assert answer.err.count(f"warning: {log}: {words}\n") == 1
+
+
+@pytest.mark.parametrize("command", ["fit", "diagnose"])
+def test_nothing_is_written_for_poses_of_another_arm(tmp_path: Path, command: str) -> None:
+    q, loads = poses_and_loads(40)
+    inches = {k: v / 0.0254 for k, v in measured(bent_model(), q, loads).items()}
+    log, new = log_in(tmp_path, columns_of(q, loads) | inches), tmp_path / "new.yaml"
+    option = "--out" if command == "fit" else "--apply"
+    line = refused(command, log, "--cell", cell_in(tmp_path), option, new)
+    assert "they look like inches, expected m" in line
+    assert not new.exists()
+
+
+def test_a_target_at_another_place_of_the_tool_is_fitted(tmp_path: Path) -> None:
+    q, loads = poses_and_loads(40)
+    tool = "tool: {tcp: {xyz: [0.06, 0.03, 0.0], rpy: [0, 0, 0]}}\n"
+    cell = cell_in(tmp_path, CELL.replace("true", "false") + tool)
+    log = log_in(tmp_path, columns_of(q, loads) | measured(bent_model(), q, loads))
+    answer = gapbridge("fit", log, "--cell", cell, "--out", tmp_path / "new.yaml")
+    assert answer.code == 0, answer.err
+    assert "they look like the flange's, not the TCP's (tool.tcp)" in answer.err
+    axial, _ = load_cell(tmp_path / "new.yaml").model.compliance()
+    np.testing.assert_allclose(axial[1:3], AXIAL[1:3], rtol=1e-3)
+
+
+def test_a_force_that_no_arm_bears_is_refused_and_a_fit_without_gain_is_warned_of(
+    tmp_path: Path,
+) -> None:
+    q, loads = poses_and_loads(40)
+    columns = columns_of(q, loads) | measured(bent_model(), q, loads)
+    cell, new = cell_in(tmp_path), tmp_path / "new.yaml"
+    columns["actual_TCP_force_0"] = np.full(40, 5000.0)
+    answer = gapbridge("fit", log_in(tmp_path, columns), "--cell", cell, "--out", new)
+    assert answer.code == 0, answer.err
+    assert "the fit does not reduce the gap" in answer.err
+    new.unlink()
+    columns["actual_TCP_force_0"][3] = 1e6
+    log = log_in(tmp_path, columns)
+    for command, (option, name) in OUTPUTS.items():
+        line = refused(command, log, "--cell", cell, option, tmp_path / name)
+        assert "row 5, column actual_TCP_force_0: found 1000000.0, expected at most 10000" in line
+        assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize("command", ["fit", "diagnose"])
+def test_a_cell_never_replaces_what_is_no_cell(tmp_path: Path, command: str) -> None:
+    q, loads = poses_and_loads(40)
+    log = log_in(tmp_path, columns_of(q, loads) | measured(bent_model(), q, loads))
+    other = tmp_path / "precious.csv"
+    other.write_text("a\n1\n")
+    option = "--out" if command == "fit" else "--apply"
+    line = refused(command, log, "--cell", cell_in(tmp_path), option, other)
+    assert "precious.csv: found .csv, expected .yaml or .yml" in line
+    assert other.read_text() == "a\n1\n"

@@ -162,3 +162,8 @@ def test_host_is_an_interface_a_serial_port_or_an_address(
 
     found = _link(host, driver, "arm", None)
     assert found == {"driver": driver, "profile": "arm", **where}
+
+
+def test_a_cell_is_a_yaml_file(tmp_path: Path) -> None:
+    line = refused("init", "127.0.0.1", "--out", tmp_path / "cell.csv")
+    assert "cell.csv: found .csv, expected .yaml or .yml" in line

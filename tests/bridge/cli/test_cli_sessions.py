@@ -193,3 +193,14 @@ def test_clocks_that_overlap_are_noted(tmp_path: Path) -> None:
     answer = gapbridge("diagnose", *logs, "--cell", cell_in(tmp_path))
     assert answer.code == 0, answer.err
     assert "the sessions' timestamps overlap" in answer.out
+
+
+def test_a_copy_of_a_log_is_no_further_session_and_no_simulation(tmp_path: Path) -> None:
+    q, loads = poses_and_loads(40)
+    columns, cell = columns_of(q, loads) | measured(SOFT, q, loads), cell_in(tmp_path)
+    log, copy = log_in(tmp_path, columns), log_in(tmp_path, columns, "copy.csv")
+    for command, more in (("fit", ("--out", tmp_path / "new.yaml")), ("diagnose", ())):
+        line = refused(command, log, copy, "--cell", cell, *more)
+        assert f"{copy}: found the rows of {log}, expected each log once" in line
+    line = refused("diagnose", log, "--sim", copy, "--cell", cell)
+    assert f"{copy}: found the rows of {log}, expected a simulator's log" in line

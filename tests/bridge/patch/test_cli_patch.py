@@ -154,7 +154,8 @@ def test_mujocos_own_sysid_reads_the_bounds(folder: Path) -> None:
         (["arm.urdf", "--out", "out.urdf", "--parameters", "bounds.py"], "expected an MJCF"),
         (["arm.xml", "--out", "out.xml", "--parameters", "bounds.txt"], "expected .py or"),
         (["arm.xml", "--out", "out.xml", "--parameters", "arm.xml"], "expected .py or"),
-        (["arm.xml", "--out", "out.yaml", "--parameters", "out.yaml"], "found for two outputs"),
+        (["arm.xml", "--out", "out.yaml"], "out.yaml: found .yaml, expected .xml or .mjcf"),
+        (["arm.urdf", "--out", "out.xml"], "out.xml: found .xml, expected .urdf"),
         (["arm.xml", "--out", "out.xml", "--tcp", "tpc"], "--tcp: found tpc"),  # it stays nominal
         (["arm.urdf", "--out", "out.urdf", "--tcp", "tpc"], "--tcp: found tpc"),
         (["arm.xml", "--out", "out.xml", "--load", "nope"], "--load: found nope"),

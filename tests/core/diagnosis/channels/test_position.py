@@ -171,5 +171,7 @@ def test_rows_without_a_reading_are_left_out():
 def test_too_few_rows_are_refused_with_what_each_channel_needs():
     session = small.session_of(0)
     log = small.log_of(session, small.readings(small.NOMINAL, session)).select(np.arange(3))
-    with pytest.raises(LogError, match=r"position: more rows; wrench: ft_raw_wrench"):
+    with pytest.raises(
+        LogError, match=r"position: at least 4 rows \(found 3\); wrench: ft_raw_wrench"
+    ):
         small.diagnose(small.model_of(), log, Metrology(sigma=small.SIGMA))

@@ -122,7 +122,7 @@ def test_rows_stay_together_where_some_have_no_reading():
     [
         ({"measured_position": np.zeros((4, 3))}, "sim.csv: found 4 rows, expected 60"),
         ({"payload": np.zeros(60)}, "found no prediction, expected one of measured_position_0"),
-        ({"measured_position": np.full((60, 3), np.nan)}, "sim.csv: row 2, .* found nan"),
+        ({"measured_position": np.full((60, 3), np.nan)}, "sim.csv: row 2, .* found nothing"),
     ],
 )
 def test_a_simulators_log_that_does_not_fit_is_refused(columns, phrase):

@@ -124,7 +124,7 @@ def test_repeated_and_backward_timestamps_are_counted():
     lines = findings(with_columns(timestamp=time))
     assert lines == [
         "1 timestamp(s) are repeated",
-        "1 timestamp(s) run backwards: rows should be in time order",
+        "1 timestamp(s) run backwards (the first is row 12): rows should be in time order",
     ]
 
 
