@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from gapbridge.bridge import api
+from gapbridge.bridge.api.records import REPORT_FILES
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text, wrong_arm_findings
 from gapbridge.bridge.cli.options import (
@@ -107,9 +108,6 @@ def diagnose(
         click.echo(f"{file}: written")
 
 
-REPORT_FILES = ("diagnosis.json", "report.html")  # in the folder of --out
-
-
 @dataclass(frozen=True)
 class _Output:
     """The output files of the command; None: not written."""
@@ -121,12 +119,12 @@ class _Output:
 
     def require_writable(self, *inputs: Path) -> None:
         """Create the folder; raise InputError if a file is not writable, or is an input."""
-        named = [] if self.out is None else [self.out / name for name in REPORT_FILES]
-        for file in (self.json_file, self.new_cell):
-            if file is not None:
-                named.append(require_writable(file, *inputs, *named))
-        if self.out is not None:
+        files = [file for file in (self.json_file, self.new_cell) if file is not None]
+        if self.out is not None:  # first: the other files may be in it
             require_folder(self.out, "--out", above=False)
+            files = [*(self.out / name for name in REPORT_FILES), *files]
+        for number, file in enumerate(files):
+            require_writable(file, *inputs, *files[:number])
 
     def write(self, diagnosed: api.Diagnosed) -> list[Path]:
         """Write the requested files and return their paths."""
