@@ -72,6 +72,17 @@ def read_text(path: Path, encoding: str = "utf-8") -> str:
     return read_bytes(path).decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
 
 
+def require_utf8(path: Path) -> None:
+    """Raise InputError for a path that is not UTF-8, which tables and many libraries do not take.
+
+    Names of files may hold any bytes.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{path}: found a name that is not UTF-8, expected one that is") from None
+
+
 def is_given() -> bool:
     """Return whether this process reads only files passed by another one."""
     return _given_files is not None

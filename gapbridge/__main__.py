@@ -18,7 +18,7 @@ def run() -> None:
 
 def _leave(*_: object) -> None:
     os.write(2, b"error: interrupted\n")
-    os._exit(1)
+    os._exit(128 + signal.SIGINT)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shutil
 from pathlib import Path
 
 import click
@@ -23,6 +24,10 @@ from benchmarks.blind.run import (
     run_blind,
     run_sensitivity,
 )
+from gapbridge.bridge.document.output_file import require_folder, require_writable
+from gapbridge.core.errors import InputError
+
+PAGE = "blind.html"
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
@@ -58,6 +63,12 @@ def main(
         return
     how: Diagnose = _function(inside) if inside else _program(command)
     wanted = names.split(",") if names else None
+    if out is not None:
+        try:
+            require_folder(out, "--out")
+            require_writable(out / PAGE)
+        except InputError as error:
+            raise click.UsageError(str(error)) from None
     count = 2 if quick else seeds
     first = fresh_seed() if first is None else first
     console.print(f"first seed {first} (repeat with --seed {first})")
@@ -78,7 +89,7 @@ def main(
         found = run_sensitivity(effects, range(first, first + count), workers, how)
         print_sensitivity(found, console)
     if out is not None:
-        page = out / "blind.html"
+        page = out / PAGE
         write_page(page, scores, "Gapbridge: the blind benchmark",
                    f"{len(scores)} cases, first seed {first}.", found)  # fmt: skip
         console.print(f"written: {page}")
@@ -87,9 +98,12 @@ def main(
 def _program(line: str) -> Command:
     """Return the program of a command line. Raises click.UsageError if it names none."""
     try:
-        return Command.parse(line)
+        command = Command.parse(line)
     except ValueError:
         raise click.UsageError(f"--command: found {line!r}, expected a program") from None
+    if shutil.which(command.command[0]) is None:
+        raise click.UsageError(f"--command: found no program {command.command[0]!r}, expected one")
+    return command
 
 
 def _function(name: str) -> Diagnose:

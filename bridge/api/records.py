@@ -16,6 +16,7 @@ from gapbridge.bridge.document.output_file import (
     require_writable,
     write_table,
     write_text,
+    write_together,
 )
 from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.arrays import Array, Mask
@@ -27,6 +28,9 @@ from gapbridge.core.model import Model
 
 if TYPE_CHECKING:
     from gapbridge.core.diagnosis.diagnosis import Diagnosis
+
+
+REPORT_FILES = ("diagnosis.json", "report.html")  # in the folder of a diagnosis' report
 
 
 @dataclass(frozen=True)
@@ -169,25 +173,25 @@ class Diagnosed:
 
     def write_report(self, folder: Path | str) -> list[Path]:
         """Write diagnosis.json and report.html, as ``--out`` does; returns their paths."""
-        from gapbridge.bridge.report import write_report  # loaded only here
+        from gapbridge.bridge.report import report_text  # loaded only here
 
         folder = Path(folder)
         require_folder(folder, "the report", above=False)
-        self.write_json(folder / "diagnosis.json")
+        document, report = (require_writable(folder / name) for name in REPORT_FILES)
         origin, name = self.document["provenance"], str(self.cell.path)
-        report = write_report(self.diagnosis, name, self.log, self.cell.model, folder, origin)
-        return [folder / "diagnosis.json", report]
+        html = report_text(self.diagnosis, name, self.log, self.cell.model, origin)
+        return write_together({document: self._json_text(), report: html})
 
     def write_json(self, path: Path | str) -> None:
         """Write the document, as ``--json`` does."""
-        write_text(
-            require_writable(Path(path)),
-            json.dumps(self.document, indent=1, allow_nan=False) + "\n",
-        )
+        write_text(require_writable(Path(path)), self._json_text())
 
     def to_json(self) -> dict[str, Any]:
         """Return the document, schema ``gapbridge.diagnosis/1``."""
         return self.document
+
+    def _json_text(self) -> str:
+        return json.dumps(self.document, indent=1, allow_nan=False) + "\n"
 
     def _effects(self, key: str) -> tuple[str, ...]:
         effects = [c["effect"] for channel in self.document["channels"] for c in channel[key]]

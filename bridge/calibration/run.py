@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import signal
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -72,7 +73,7 @@ def run_session(cell: Cell, options: SessionOptions) -> None:
         except KeyboardInterrupt:
             prompt.say()
             prompt.say(f"interrupted; {_how_to_resume(cell, options, session)}")
-            raise click.exceptions.Exit(1) from None
+            raise click.exceptions.Exit(128 + signal.SIGINT) from None
         except LinkError:
             prompt.say(_how_to_resume(cell, options, session))
             raise

@@ -13,18 +13,19 @@ import threading
 from collections.abc import Iterator
 from pkgutil import resolve_name
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 
 from gapbridge.bridge.cli.progress import CompileProgress
-from gapbridge.bridge.cli.table import COMMANDS
+from gapbridge.bridge.cli.table import COMMANDS, ROBOT
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.kernels import compiling
 from gapbridge.drivers.clock import SYSTEM
 
 INTERRUPT_RETRY = 0.02  # s until an interrupt inside LLVM is tried again
 SUCCESS, FAILURE, UNUSABLE_INPUT = 0, 1, 2
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # as a shell has it
 UNUSABLE_PATH = (errno.EACCES, errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP)
 
 
@@ -106,9 +107,9 @@ def gapbridge() -> None:
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and exit with its code; never shows a traceback."""
-    install_interrupt_handler()
-    with _usable_streams():
-        code = _run(sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with _usable_streams(), _handled_signals(arguments):
+        code = _run(arguments)
     gc.freeze()  # saves the final garbage collection, 0.1 s
     sys.exit(code)
 
@@ -143,8 +144,9 @@ def _run(arguments: list[str]) -> int:
         return _fail(f"{error.format_message()} (see {command} --help)", UNUSABLE_INPUT)
     except click.ClickException as error:
         return _fail(error.format_message(), UNUSABLE_INPUT)
-    except (KeyboardInterrupt, click.Abort):
-        return _fail("interrupted", FAILURE)
+    except (KeyboardInterrupt, click.Abort) as error:
+        ended = isinstance(error.__cause__ or error, Terminated)  # click wraps it
+        return _fail("terminated", TERMINATED) if ended else _fail("interrupted", INTERRUPTED)
     except GapbridgeError as error:
         return _fail(str(error), error.exit_code)
     except OSError as error:
@@ -174,7 +176,8 @@ def _is_of_stdout(error: OSError) -> bool:
 
 
 def _fail(text: str, code: int) -> int:
-    sys.stderr.write(f"error: {' '.join(text.split())}\n")
+    with contextlib.suppress(OSError):  # a full disk
+        sys.stderr.write(f"error: {' '.join(text.split())}\n")
     return code
 
 
@@ -183,29 +186,50 @@ def _crash(error: Exception) -> int:
     import tempfile  # a twentieth of the time of --help
     import traceback
 
-    with tempfile.NamedTemporaryFile(
-        "w", prefix="gapbridge-crash-", suffix=".txt", delete=False, encoding="utf-8"
-    ) as file:
+    what = " ".join(str(error).split()) or "no message"
+    details = "no folder for details can be written to"
+    with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(
+        "w", prefix="gapbridge-crash-", suffix=".txt", delete=False, encoding="utf-8",
+        errors="backslashreplace",  # arguments may be any bytes
+    ) as file:  # fmt: skip
         file.write(" ".join(sys.argv) + "\n\n")
         traceback.print_exception(error, file=file)
-    what = " ".join(str(error).split()) or "no message"
-    return _fail(f"{type(error).__name__}: {what} (details: {file.name})", FAILURE)
+        file.flush()
+        details = f"details: {file.name}"
+    return _fail(f"{type(error).__name__}: {what} ({details})", FAILURE)
 
 
-def install_interrupt_handler() -> None:
-    """Let Ctrl-C end the command, but never inside LLVM; an ignored SIGINT stays ignored.
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: ends a command as Ctrl-C does, so that it removes what is half written."""
+
+
+@contextlib.contextmanager
+def _handled_signals(arguments: list[str]) -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM end the command, but never inside LLVM; an ignored one stays ignored.
 
     LLVM calls Python back while it loads a function. An exception there is printed and lost, or the
-    half-loaded code crashes the process, which leaves an incomplete file.
+    half-loaded code crashes the process, which leaves an incomplete file. Commands of a robot keep
+    their own SIGTERM.
     """
-    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if is_default and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, _interrupted)
+    command = COMMANDS.get(arguments[0]) if arguments else None
+    handled: dict[int, Any] = {signal.SIGINT: signal.default_int_handler}
+    if command is None or not command[0].startswith(ROBOT):
+        handled[signal.SIGTERM] = signal.SIG_DFL
+    if threading.current_thread() is not threading.main_thread():
+        handled = {}
+    handled = {n: default for n, default in handled.items() if signal.getsignal(n) is default}
+    for number in handled:
+        signal.signal(number, _interrupted)
+    try:
+        yield
+    finally:
+        for number, default in handled.items():
+            signal.signal(number, default)
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
     if not _in_llvm(frame):
-        raise KeyboardInterrupt
+        raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
     retry = threading.Timer(INTERRUPT_RETRY, os.kill, (os.getpid(), number))
     retry.daemon = True
     retry.start()

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-_CELL, _LOG, _ROBOT = (f"gapbridge.bridge.cli.{folder}" for folder in ("cell", "log", "robot"))
+_CELL, _LOG, ROBOT = (f"gapbridge.bridge.cli.{folder}" for folder in ("cell", "log", "robot"))
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": (f"{_ROBOT}.demo:demo", "Calibrate, compensate and diagnose a simulated cell."),
+    "demo": (f"{ROBOT}.demo:demo", "Calibrate, compensate and diagnose a simulated cell."),
     "init": (f"{_CELL}.init:init", "Write a cell file from what a controller reports."),
     "check": (f"{_CELL}.check:check", "Check a cell file for mistakes."),
     "diff": (f"{_CELL}.diff:diff", "List the differences of two cells."),
-    "simulate": (f"{_ROBOT}.simulate:simulate", "Run a simulated controller for a cell."),
-    "run": (f"{_ROBOT}.run:run", "Run the on-cell daemon."),
-    "status": (f"{_ROBOT}.status:status", "Show what the daemon of a cell does."),
-    "arm": (f"{_ROBOT}.arm:arm", "Make the daemon of a cell write setpoints."),
-    "disarm": (f"{_ROBOT}.arm:disarm", "Make the daemon of a cell ramp out and observe."),
+    "simulate": (f"{ROBOT}.simulate:simulate", "Run a simulated controller for a cell."),
+    "run": (f"{ROBOT}.run:run", "Run the on-cell daemon."),
+    "status": (f"{ROBOT}.status:status", "Show what the daemon of a cell does."),
+    "arm": (f"{ROBOT}.arm:arm", "Make the daemon of a cell write setpoints."),
+    "disarm": (f"{ROBOT}.arm:disarm", "Make the daemon of a cell ramp out and observe."),
     "calibrate": (
-        f"{_ROBOT}.calibrate:calibrate",
+        f"{ROBOT}.calibrate:calibrate",
         "Run a guided calibration session; it can be resumed.",
     ),
     "export": (f"{_LOG}.export:export_recording", "Convert a recording of the daemon to a log."),

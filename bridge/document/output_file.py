@@ -11,7 +11,8 @@ import contextlib
 import io
 import os
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -25,14 +26,15 @@ CSV = ".csv"
 YAML = (".yaml", ".yml")
 LONG = 50_000  # numbers from which pyarrow writes a table as text: ten times as fast
 MODE = 0o640  # of a new file
+UNPRINTABLE = "backslashreplace"  # characters that UTF-8 cannot hold, as in names of files
 FOLDER_MODE = 0o750  # of a new folder of recordings, sessions and the like
 
 
 def require_writable(path: Path, *others: Path) -> Path:
     """Return the path if a file can be written there; called before the work is done.
 
-    ``others``: inputs, and outputs named before. Raises InputError where its folder is missing, it
-    is a folder or a device, or it is one of the others.
+    ``others``: inputs, and outputs named before. Raises InputError where its folder is missing or
+    takes no file, it is a folder or a device, or it is one of the others.
     """
     if path.is_dir():
         raise InputError(f"{path}: found a folder, expected a file to write")
@@ -41,13 +43,17 @@ def require_writable(path: Path, *others: Path) -> Path:
     folder = path.parent
     if not folder.is_dir():
         raise InputError(f"{path}: found no folder {folder}, expected an existing one")
+    try:  # no question finds as much: a full disk, a link to nowhere, a name that is too long
+        _, part = _place_and_part(path)
+        os.close(private(part, os.O_WRONLY | os.O_CREAT))
+        part.unlink()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     for file in others:
         if path.exists() and file.exists() and path.samefile(file):
             raise InputError(f"{path}: found the output to be the input {file}, expected another")
         if os.path.realpath(path) == os.path.realpath(file):
             raise InputError(f"{path}: found for two outputs, expected two files")
-    if not os.access(folder, os.W_OK):
-        raise InputError(f"{path}: found a folder {folder} that cannot be written to")
     return path
 
 
@@ -99,9 +105,12 @@ def require_folder(path: Path, option: str, *, above: bool = True) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[IO[str]]:
-    """Open a text file that replaces ``path`` when the block ends without an error."""
+    """Open a text file that replaces ``path`` when the block ends without an error.
+
+    What is not Unicode (a file's name may hold any bytes) is escaped.
+    """
     with replacing_bytes(path) as binary:
-        file = io.TextIOWrapper(binary, "utf-8", newline="\n")
+        file = io.TextIOWrapper(binary, "utf-8", UNPRINTABLE, newline="\n")
         try:
             yield file
         finally:
@@ -114,23 +123,56 @@ def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
 
     Raises RunError where it cannot be written; what the block raises of another file stays.
     """
-    place = Path(os.path.realpath(path))
-    part = place.with_name(f".{place.name}.{os.getpid()}.part")
+    with _part_of(path) as part:
+        yield part.file
+        part.sync()
+        part.rename()
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A file that is being written, beside its place."""
+
+    file: IO[bytes]
+    path: Path
+    place: Path
+
+    def sync(self) -> None:
+        self.file.flush()
+        os.fsync(self.file.fileno())
+
+    def rename(self) -> None:
+        os.replace(self.path, self.place)
+        sync_folder(self.place.parent)  # else a power cut can lose the new file's name
+
+
+@contextlib.contextmanager
+def _part_of(path: Path) -> Iterator[_Part]:
+    """Open the part of a file; it is removed at the end, unless it was renamed."""
+    part = None
     try:
+        place, part = _place_and_part(path)
         with open(part, "wb", opener=private) as file:
             _keep_mode(place, file.fileno())
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, place)
-        sync_folder(place.parent)  # else a power cut can lose the new file's name
+            yield _Part(file, part, place)
     except OSError as error:
         if error.filename not in (None, str(part)):
             raise
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
-        with contextlib.suppress(OSError):
-            part.unlink()
+        if part is not None:
+            with contextlib.suppress(OSError):
+                part.unlink()
+
+
+def _place_and_part(path: Path) -> tuple[Path, Path]:
+    """Return where a file is, links followed, and its part beside it.
+
+    Raises OSError where the path is relative and the working folder was deleted.
+    """
+    place = Path(os.path.realpath(path))
+    part = place.with_name(f".{place.name}.{os.getpid()}.part")
+    return place, part
 
 
 def sync_folder(folder: Path) -> None:
@@ -166,6 +208,32 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file in one step."""
     with replacing(path) as file:
         file.write(text)
+
+
+def write_together(contents: Mapping[Path, str | bytes]) -> list[Path]:
+    """Write files that belong together, and return their paths.
+
+    All are on the disk before the first is renamed: what fails before leaves the old ones.
+    """
+    with contextlib.ExitStack() as stack:
+        parts = []
+        for path, content in contents.items():
+            part = stack.enter_context(_part_of(path))
+            part.file.write(content if isinstance(content, bytes) else _encoded(content))
+            part.sync()
+            parts.append(part)
+        for part in parts:
+            part.rename()
+    return list(contents)
+
+
+def printable(name: object) -> str:
+    """Return a name as text that UTF-8 can hold: bytes of it that are not UTF-8 are escaped."""
+    return _encoded(str(name)).decode()
+
+
+def _encoded(text: str) -> bytes:
+    return text.encode("utf-8", UNPRINTABLE)
 
 
 def write_table(path: Path, columns: Sequence[str], table: Array) -> None:

@@ -23,6 +23,7 @@ from reportlab.platypus import Paragraph as Text
 
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document import drawing as drawn
+from gapbridge.bridge.document.output_file import printable
 from gapbridge.bridge.document.pdf_table import columns_table, table, table_row, tiles_table
 from gapbridge.bridge.document.pdf_text import BOLD, PLAIN, STYLES, badge_markup, load_fonts, markup
 
@@ -68,7 +69,8 @@ def pdf(document: blocks.Document) -> bytes:
     load_fonts()
     file = io.BytesIO()
     template = BaseDocTemplate(
-        file, pagesize=A4, title=document.title, author="Gapbridge", subject=document.subtitle,
+        file, pagesize=A4, title=printable(document.title), author="Gapbridge",
+        subject=printable(document.subtitle),
         leftMargin=SIDE, rightMargin=SIDE, topMargin=TOP, bottomMargin=BOTTOM,
     )  # fmt: skip
     frame = Frame(SIDE, BOTTOM, WIDTH, A4[1] - TOP - BOTTOM, 0, 0, 0, 0)

@@ -15,6 +15,7 @@ from reportlab.pdfbase.cidfonts import UnicodeCIDFont
 from reportlab.pdfbase.ttfonts import TTFont
 
 from gapbridge.bridge.document.blocks import Badge
+from gapbridge.bridge.document.output_file import printable
 
 PLAIN, BOLD = "Gapbridge", "Gapbridge-Bold"
 HAN, KANA, HANGUL = "STSong-Light", "HeiseiKakuGo-W5", "HYGothic-Medium"
@@ -42,6 +43,7 @@ def load_fonts() -> None:
 
 def markup(text: str) -> str:
     """Return a text as reportlab's markup, with fonts for Chinese, Japanese and Korean."""
+    text = printable(text)
     if text.isascii():
         return escape(text)
     japanese = re.search(r"[\u3040-\u30ff]", text) is not None

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from gapbridge.bridge.document.output_file import printable
 from gapbridge.core.calibration.spread import Spread
 
 if TYPE_CHECKING:
@@ -30,7 +31,9 @@ def provenance(
     command is ``command`` and its arguments are these files and ``options``.
     """
     context = click.get_current_context(silent=True)
-    paths_by_role = {role: [str(path) for path in paths] for role, paths in files.items() if paths}
+    paths_by_role = {
+        role: [printable(path) for path in paths] for role, paths in files.items() if paths
+    }
     called = paths_by_role | {name: value for name, value in options.items() if value}
     return {
         "version": installed_version(),
@@ -38,7 +41,7 @@ def provenance(
         "command": command if context is None else _command(context),
         "arguments": called if context is None else _arguments(context),
         "files": [
-            {"role": role, "name": path.name, "sha256": digest(path)}
+            {"role": role, "name": printable(path.name), "sha256": digest(path)}
             for role, paths in files.items()
             for path in paths
         ],
@@ -156,4 +159,4 @@ def _arguments(context: click.Context) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
-    return value if isinstance(value, (bool, int, float)) else str(value)
+    return value if isinstance(value, (bool, int, float)) else printable(value)

@@ -43,9 +43,12 @@ class Journal:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Sync it to disk and close it."""
-        os.fsync(self._file.fileno())
-        self._file.close()
+        """Sync it to disk and close it. Raises RunError where that fails."""
+        try:
+            with self._file:
+                os.fsync(self._file.fileno())
+        except OSError as error:
+            raise self._unwritten(error) from None
 
     def known(self, key: str) -> Outcome | None:
         """Return the outcome of a task in an earlier run; None: there is none."""
@@ -61,7 +64,10 @@ class Journal:
                 os.fsync(self._file.fileno())
                 self._synced = self._now()
         except OSError as error:
-            raise RunError(f"{self.path}: cannot be written: {error.strerror}") from None
+            raise self._unwritten(error) from None
+
+    def _unwritten(self, error: OSError) -> RunError:
+        return RunError(f"{self.path}: cannot be written: {error.strerror}")
 
     def _read(self) -> dict[str, Outcome]:
         """Return the outcomes of earlier runs by key; an incomplete last line is removed."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from gapbridge.bridge.cell import load_cell, save_cell
 from gapbridge.bridge.document.numbers import with_unit
-from gapbridge.bridge.document.output_file import replacing_bytes, write_text
+from gapbridge.bridge.document.output_file import write_text, write_together
 from gapbridge.bridge.document.provenance import fitted, intervals_of, provenance
 from gapbridge.bridge.fleet.diagnosis_summary import FleetDiagnosis, summarise
 from gapbridge.bridge.fleet.fit_summary import (
@@ -24,10 +24,16 @@ from gapbridge.bridge.fleet.fit_summary import (
     flexibility_rows,
     session_figures,
 )
-from gapbridge.bridge.fleet.report.page import write_diagnosis_report, write_fit_report
+from gapbridge.bridge.fleet.report.page import diagnosis_report, fit_report
 from gapbridge.bridge.fleet.report.shared_sections import quantity_title, type_title
 from gapbridge.bridge.fleet.runner import FleetRun
-from gapbridge.bridge.fleet.session import CELL_TABLE, RESULTS_FILE, SESSIONS_FILE, Fleet
+from gapbridge.bridge.fleet.session import (
+    CELL_TABLE,
+    REPORT_FILE,
+    RESULTS_FILE,
+    SESSIONS_FILE,
+    Fleet,
+)
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.bridge.report.labels import counted, effect_title, joint_list
 from gapbridge.core.calibration.spread import Spread
@@ -72,13 +78,11 @@ FIT_COLUMNS = {
 def write_diagnosis(done: FleetRun, fleet: Fleet, folder: Path) -> tuple[list[str], list[Path]]:
     """Write the results of ``fleet diagnose``; returns lines for the terminal, and the files."""
     summary = summarise(done.outcomes)
-    files = [
-        write_parquet(folder / RESULTS_FILE, EFFECT_COLUMNS, list(effect_rows(done.outcomes))),
-        write_parquet(
-            folder / SESSIONS_FILE, DIAGNOSIS_COLUMNS, list(diagnosis_rows(done.outcomes))
-        ),
-        write_diagnosis_report(summary, done, fleet, folder),
-    ]
+    files = write_together({
+        folder / RESULTS_FILE: parquet(EFFECT_COLUMNS, list(effect_rows(done.outcomes))),
+        folder / SESSIONS_FILE: parquet(DIAGNOSIS_COLUMNS, list(diagnosis_rows(done.outcomes))),
+        folder / REPORT_FILE: diagnosis_report(summary, done, fleet),
+    })  # fmt: skip
     return _diagnosis_lines(summary), files
 
 
@@ -89,11 +93,11 @@ def write_fit(
     summary = fit_fleet(done.outcomes)
     figures = session_figures(summary)
     sessions = [row | figures.get(row["session"], {}) for row in session_rows(done.outcomes)]
-    files = [
-        write_parquet(folder / RESULTS_FILE, FLEXIBILITY_COLUMNS, list(flexibility_rows(summary))),
-        write_parquet(folder / SESSIONS_FILE, FIT_COLUMNS, sessions),
-        write_fit_report(summary, done, fleet, folder),
-    ]
+    files = write_together({
+        folder / RESULTS_FILE: parquet(FLEXIBILITY_COLUMNS, list(flexibility_rows(summary))),
+        folder / SESSIONS_FILE: parquet(FIT_COLUMNS, sessions),
+        folder / REPORT_FILE: fit_report(summary, done, fleet),
+    })  # fmt: skip
     if cells is not None:
         files.append(write_cells(summary, cells)[-1])
     return _fit_lines(summary), files
@@ -195,18 +199,16 @@ def _file_name(arm: str, used: set[str]) -> str:
     return name
 
 
-def write_parquet(
-    path: Path, columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]]
-) -> Path:
-    """Write rows with typed columns atomically; missing values are null."""
+def parquet(columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """Return rows with typed columns as a Parquet file; missing values are null."""
     import pyarrow
-    from pyarrow import parquet
+    from pyarrow.parquet import write_table
 
     schema = pyarrow.schema([(name, _arrow_type(pyarrow, kind)) for name, kind in columns.items()])
     table = pyarrow.Table.from_pylist(list(rows), schema=schema)
-    with replacing_bytes(path) as file:
-        parquet.write_table(table, file, compression="zstd")
-    return path
+    file = io.BytesIO()
+    write_table(table, file, compression="zstd")
+    return file.getvalue()
 
 
 def session_rows(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gapbridge.bridge.document.output_file import printable
 from gapbridge.bridge.fleet.cell_source import CellSource
 from gapbridge.bridge.fleet.journal import Journal
 from gapbridge.bridge.fleet.session import Fleet, Session, natural_key
@@ -17,6 +18,7 @@ from gapbridge.bridge.fleet.task import BAD, CRASHED, DIED, DONE, Outcome, Sessi
 from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.bridge.report.labels import counted
 from gapbridge.core.errors import InputError
+from gapbridge.core.files import require_utf8
 
 JOURNAL_VERSION = 2  # format of the results, part of every key
 STATES = {BAD: "cannot be used", CRASHED: "failed", DIED: "killed their workers"}
@@ -41,12 +43,15 @@ def make_tasks(
         task = Task("", session.arm, session.name, session.log, Path(), job, options)
         try:
             cell = cells.cell_of(session)
+            for path in (session.log, cell):  # as the tables of results hold them
+                require_utf8(path)
             key = _key(session, cell, job, options)
             tasks.append(Task(key, session.arm, session.name, session.log, cell, job, options))
         except InputError as error:
-            bad.append(task.outcome(BAD, error=" ".join(str(error).split())))
+            bad.append(task.outcome(BAD, error=" ".join(printable(error).split())))
         except OSError as error:
-            bad.append(task.outcome(BAD, error=f"{session.log}: {error.strerror}"))
+            text = printable(f"{session.log}: {error.strerror}")
+            bad.append(task.outcome(BAD, error=text))
     return tasks, bad
 
 

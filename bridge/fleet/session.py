@@ -14,6 +14,7 @@ from gapbridge.core.log.columns import PARQUET
 
 LOGS = (".csv", *PARQUET)
 RESULTS_FILE, SESSIONS_FILE, CELL_TABLE = "results.parquet", "sessions.parquet", "cells.csv"
+REPORT_FILE = "report.html"
 WILDCARDS = re.compile(r"[*?\[]")
 
 
@@ -48,13 +49,14 @@ def find_sessions(
     A log's arm is the first folder below the folder of the fleet; for a log in that folder itself,
     the file's name up to its first underscore. ``pattern`` is a regular expression that matches
     the arm in the path below the folder of the fleet instead (first group, or the whole match).
-    The files ``without``, tables that a run reads or writes, are ignored.
+    The files ``without``, tables that a run reads or writes, are ignored, and so are those that
+    an earlier run has written.
     Raises InputError if there is no log, or ``pattern`` does not match one.
     """
     found = {log for text in where for log in _logs(text)}
     tables = {os.path.realpath(table) for table in without}
     logs = sorted(
-        (log for log in found if os.path.realpath(log) not in tables),
+        (log for log in found if os.path.realpath(log) not in tables and not _is_table(log)),
         key=lambda p: natural_key(str(p)),
     )
     if not logs:
@@ -78,6 +80,21 @@ def natural_key(text: str) -> list[tuple[int, int, str]]:
         for part in re.split(r"(\d+)", text)
         if part
     ]
+
+
+def _is_table(path: Path) -> bool:
+    """Return whether a file has the name of a table that runs write, and its column ``arm``."""
+    try:
+        if path.name == CELL_TABLE:
+            with path.open("rb") as file:
+                return file.readline().strip() == b"arm,cell"
+        if path.name in (RESULTS_FILE, SESSIONS_FILE):
+            from pyarrow import parquet  # loaded where there is such a file
+
+            return "arm" in parquet.read_schema(path).names
+    except (OSError, ValueError):  # the reading of the log says what is wrong
+        pass
+    return False
 
 
 def _logs(text: str) -> list[Path]:

@@ -12,6 +12,7 @@ from typing import Any
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.document.output_file import printable
 from gapbridge.bridge.fleet.session import natural_key
 from gapbridge.core.errors import ArmError, CellError, GapbridgeError, LogError
 from gapbridge.core.log.log import Log
@@ -34,9 +35,12 @@ class Task:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def outcome(self, state: str, seconds: float = 0.0, **rest: Any) -> Outcome:
-        """Return an outcome of this task; ``rest`` are further fields of it."""
-        log, cell = str(self.log), str(self.cell)
-        return Outcome(self.key, self.arm, self.session, log, cell, state, seconds, **rest)
+        """Return an outcome of this task; ``rest`` are further fields of it.
+
+        Its names are those of UTF-8, with the bytes of a path that are not escaped.
+        """
+        arm, session, log, cell = map(printable, (self.arm, self.session, self.log, self.cell))
+        return Outcome(self.key, arm, session, log, cell, state, seconds, **rest)
 
     def died_outcome(self) -> Outcome:
         """Return the outcome of a task that has killed MAX_DEATHS workers."""
@@ -97,7 +101,7 @@ def _result(task: Task) -> tuple[str, dict[str, Any]]:
 
 
 def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
+    return " ".join(printable(error).split())
 
 
 @functools.lru_cache(maxsize=64)

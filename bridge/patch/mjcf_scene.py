@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from gapbridge.bridge.patch.changes import Axes
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InputError
+from gapbridge.core.files import require_utf8
 from gapbridge.core.rotation import transform
 
 ARMATURE = 1e-3  # kg m2 of an added joint, which MuJoCo needs to integrate stiff springs
@@ -80,6 +81,7 @@ class Scene:
                 f"{path}: found an MJCF model, expected MuJoCo to be installed: "
                 "pip install 'gapbridge[mujoco]'"
             ) from None
+        require_utf8(path)
         self.path = path
         self.mujoco = mujoco
         try:

@@ -25,6 +25,7 @@ from gapbridge.bridge.patch.model_format import (
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
+from gapbridge.core.files import require_utf8
 from gapbridge.core.rotation import transform
 
 if TYPE_CHECKING:
@@ -83,6 +84,7 @@ class _Stage:
                 f"{path}: found a USD model, expected USD's Python package to be installed: "
                 "pip install 'gapbridge[usd]'"
             ) from None
+        require_utf8(path.resolve())
         self.Gf, self.Sdf, self.UsdGeom, self.UsdPhysics = Gf, Sdf, UsdGeom, UsdPhysics
         self.path, self.layer = path, Sdf.Layer.CreateAnonymous(".usda")
         self.layer.subLayerPaths.append(str(path.resolve()))

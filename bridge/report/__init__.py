@@ -1,5 +1,5 @@
 """The report of a diagnosis: one self-contained HTML file, one section a module."""
 
-from gapbridge.bridge.report.page import SECTIONS, write_report
+from gapbridge.bridge.report.page import SECTIONS, report_text
 
-__all__ = ["SECTIONS", "write_report"]
+__all__ = ["SECTIONS", "report_text"]

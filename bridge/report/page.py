@@ -12,7 +12,6 @@ from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.findings import finding_text
 from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.numbers import with_unit
-from gapbridge.bridge.document.output_file import write_text
 from gapbridge.bridge.document.provenance import origin_blocks, origin_line
 from gapbridge.bridge.report.answer import answer
 from gapbridge.bridge.report.gap_location import effect_tables, gap_location
@@ -29,21 +28,16 @@ from gapbridge.core.model import Model
 
 LISTED = 20  # most outliers listed per channel
 
-FILE = "report.html"
 
-
-def write_report(
-    diagnosis: Diagnosis, cell_name: str, log: Log, model: Model, folder: Path,
+def report_text(
+    diagnosis: Diagnosis, cell_name: str, log: Log, model: Model,
     origin: Mapping[str, Any] | None = None,
-) -> Path:  # fmt: skip
-    """Write ``report.html`` into a folder and return its path.
+) -> str:  # fmt: skip
+    """Return the report as HTML.
 
-    ``model`` is the cell's model as it was diagnosed, ``origin`` the result's provenance. Raises
-    RunError where the file cannot be written.
+    ``model`` is the cell's model as it was diagnosed, ``origin`` the result's provenance.
     """
-    path = folder / FILE
-    write_text(path, html(document(Material(diagnosis, cell_name, log, model, origin or {}))))
-    return path
+    return html(document(Material(diagnosis, cell_name, log, model, origin or {})))
 
 
 def document(material: Material) -> blocks.Document:

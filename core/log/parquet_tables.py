@@ -65,7 +65,8 @@ def _opened(path: Path) -> pyarrow.parquet.ParquetFile:
     import pyarrow  # only where there is Parquet
     from pyarrow.parquet import ParquetFile
 
-    given = pyarrow.BufferReader(read_bytes(path)) if is_given() else path
+    # pyarrow's own files take no name that is not UTF-8, unless it is bytes
+    given = pyarrow.BufferReader(read_bytes(path)) if is_given() else pyarrow.OSFile(bytes(path))
     # not ahead of what is asked for: whole columns would be
     return ParquetFile(given, buffer_size=BUFFER, pre_buffer=False)
 

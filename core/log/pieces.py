@@ -65,9 +65,7 @@ class LogPieces:
     def count(self) -> int:
         """Return the number of rows, from the file's metadata where it has it."""
         if self.path.suffix.lower() in PARQUET:
-            from pyarrow import parquet
-
-            return int(parquet.ParquetFile(self.path).metadata.num_rows)
+            return ParquetColumns(self.path).rows
         return sum(len(piece) for piece in self)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -12,11 +13,18 @@ import pytest
 from gapbridge.bridge.calibration.session.journal import Journal as SessionJournal
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.saving import save_cell
-from gapbridge.bridge.document.output_file import replacing, require_folder, write_text
+from gapbridge.bridge.document.output_file import (
+    replacing,
+    require_folder,
+    require_writable,
+    write_text,
+    write_together,
+)
 from gapbridge.bridge.fleet.journal import Journal as FleetJournal
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.bridge.recording.segment import Segment
+from gapbridge.core.errors import InputError, RunError
 from gapbridge.drivers.clock import SYSTEM
 
 CELL = "robot: {model: ur10e}\npayload: {mass: 5.0}\n"
@@ -97,3 +105,53 @@ def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path: Path, kept: int
     path.chmod(kept)
     write_text(path, CELL)
     assert mode(path) == kept
+
+
+def test_of_files_that_belong_together_all_are_replaced_or_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = [tmp_path / name for name in ("diagnosis.json", "report.html")]
+    assert write_together(dict.fromkeys(paths, "old")) == paths
+
+    def full(_: int) -> None:  # at the second file
+        if (tmp_path / f".report.html.{os.getpid()}.part").exists():
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(RunError, match=r"report\.html: cannot be written: No space left"):
+        write_together(dict.fromkeys(paths, b"new"))
+    assert [path.read_text() for path in paths] == ["old", "old"]
+    assert sorted(tmp_path.iterdir()) == paths
+
+
+def test_what_takes_no_file_is_noticed_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dangling = tmp_path / "o.csv"
+    dangling.symlink_to(tmp_path / "none" / "o.csv")
+    longest = tmp_path / f"{'x' * 251}.csv"  # alone it is short enough
+    for path, reason in ((dangling, "No such file"), (longest, "File name too long")):
+        with pytest.raises(InputError, match=f"{path.name}: cannot be written: {reason}"):
+            require_writable(path)
+    assert require_writable(tmp_path / "p.csv") == tmp_path / "p.csv"
+    assert list(tmp_path.iterdir()) == [dangling]
+    monkeypatch.setattr(os, "open", no_space)
+    with pytest.raises(InputError, match=r"p\.csv: cannot be written: No space left"):
+        require_writable(tmp_path / "p.csv")
+
+
+def no_space(*_: object) -> int:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_working_folder_that_was_deleted_takes_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with pytest.raises(InputError, match=r"o\.csv: cannot be written: No such file"):
+        require_writable(Path("o.csv"))
+    with pytest.raises(RunError, match=r"o\.csv: cannot be written: No such file"):
+        write_text(Path("o.csv"), "")

@@ -17,9 +17,9 @@ from benchmarks.losing_disk import LosingDisk, Place
 from gapbridge.bridge.calibration.session.journal import FILE, Journal, read_entries
 from gapbridge.bridge.cell.saving import write_text
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
-from gapbridge.bridge.document.output_file import write_table
+from gapbridge.bridge.document.output_file import write_table, write_together
 from gapbridge.bridge.fleet.journal import Journal as FleetJournal
-from gapbridge.bridge.fleet.output import write_parquet
+from gapbridge.bridge.fleet.output import parquet
 from gapbridge.bridge.fleet.task import DONE, Outcome
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory, slices_of
@@ -135,7 +135,7 @@ def tables(folder: Path, cut: Callable[[], Path], expect: Callable[[Check], None
     done = 0
     for count in (3000, 5):
         expect(among((done, done), (count, done)))
-        write_parquet(folder / "sessions.parquet", kinds, rows(count))
+        write_together({folder / "sessions.parquet": parquet(kinds, rows(count))})
         expect(among((count, done), (count, count)))
         write_table(folder / "residuals.csv", ("a", "b"), np.ones((count, 2)))
         expect(among((count, count)))

@@ -3,6 +3,7 @@
 import bz2
 import gzip
 import lzma
+import os
 from pathlib import Path
 
 import numpy as np
@@ -149,14 +150,16 @@ def test_quoted_headers_and_cells_are_read(tmp_path):
     np.testing.assert_allclose(read_log(write(tmp_path, text), 6).require("actual_q"), joints())
 
 
-@pytest.mark.parametrize("suffix", [".parquet", ".pq"])
+@pytest.mark.parametrize("suffix", [".parquet", ".pq", os.fsdecode(b"\xff.pq")])
 def test_parquet_is_the_same_log(tmp_path, suffix):
     path = tmp_path / f"log{suffix}"
     columns = {name: np.array(joints())[:, i] for i, name in enumerate(JOINTS)}
     counts = np.array([1, 2, 3], dtype=np.int32)
     whole = {**columns, "payload": counts, "name": ["a", "b", "c"]}
-    parquet.write_table(pyarrow.table(whole), path)
+    with path.open("wb") as file:  # by its name, pyarrow takes UTF-8 only
+        parquet.write_table(pyarrow.table(whole), file)
     log = read_log(path, 6)
+    assert LogPieces(path, 6).count() == 3
     np.testing.assert_allclose(log.require("actual_q"), joints())
     np.testing.assert_array_equal(log.get("payload"), [1, 2, 3])
 

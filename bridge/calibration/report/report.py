@@ -27,7 +27,7 @@ from gapbridge.bridge.calibration.report.sections.verification_sections import (
 )
 from gapbridge.bridge.document.blocks import Document, Part, Section, Table, parts
 from gapbridge.bridge.document.html import html
-from gapbridge.bridge.document.output_file import replacing_bytes, write_text
+from gapbridge.bridge.document.output_file import write_together
 from gapbridge.core.calibration.payload_session import PayloadCalibration
 
 AnyData = CalibrationData | VerificationData | ShortSessionData[Any]
@@ -71,11 +71,9 @@ def write_report(data: AnyData, out: Path) -> tuple[Path, Path]:
     else:
         name, kind, sections = "tool", "Tool", parts(TOOL, data)
     document = _document(kind, data.session, sections)
-    html_path, pdf_path = out / f"{name}.html", out / f"{name}.pdf"
-    write_text(html_path, html(document))
-    with replacing_bytes(pdf_path) as file:
-        file.write(pdf(document))
-    return html_path, pdf_path
+    page, paper = out / f"{name}.html", out / f"{name}.pdf"
+    write_together({page: html(document), paper: pdf(document)})
+    return page, paper
 
 
 def _document(kind: str, session: SessionFacts, sections: tuple[Part, ...]) -> Document:

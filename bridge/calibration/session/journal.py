@@ -37,15 +37,15 @@ class Journal:
     def open(self) -> None:
         """Lock the journal and read its entries.
 
-        Raises InputError if another process has locked it or a line is damaged, RunError if it
-        cannot be written.
+        Raises InputError if it cannot be written, another process has locked it, or a line is
+        damaged.
         """
         try:
             make_folder(self.path.parent)
             self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, MODE)
             sync_folder(self.path.parent)
         except OSError as error:
-            raise RunError(f"{self.path}: cannot be written: {error.strerror}") from None
+            raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

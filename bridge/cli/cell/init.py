@@ -22,7 +22,7 @@ from gapbridge.bridge.cell.schema import CellFile
 from gapbridge.bridge.cell.sections import LinkSettings
 from gapbridge.bridge.cli.options import FILE
 from gapbridge.bridge.document.output_file import require_cell, write_text
-from gapbridge.core.arm import builtin_arm
+from gapbridge.core.arm import Arm, builtin_arm
 from gapbridge.core.errors import GapbridgeError, Implausible, InputError, InvalidStateError
 from gapbridge.core.model import Model
 from gapbridge.core.urdf import arm_from_urdf
@@ -94,7 +94,10 @@ def init(
         link[key] = value
     settings = _settings(link)
     located = settings.located(Path.cwd())
-    facts = enquire(host, SYSTEM) if driver == "ur_rtde" else _read_facts(located, arm_options)
+    given = _given_arm(arm_options)  # before the controller is reached
+    facts = (
+        enquire(host, SYSTEM) if driver == "ur_rtde" else _read_facts(located, given, arm_options)
+    )
     link |= {str(keys[-1]): _path_from_cell(path, out) for keys, path in settings.paths()}
     urdf = None if arm_options.urdf is None else _path_from_cell(arm_options.urdf, out)
     options = InitOptions(link, arm_options.model, urdf, arm_options.tip)
@@ -152,24 +155,29 @@ def _settings(link: dict[str, Any]) -> LinkSettings:
     return settings
 
 
-def _read_facts(link: LinkSettings, arm_options: ArmOptions) -> ControllerFacts:
-    """Return what the controller reports by its profile; the arm's joints must be known."""
+def _given_arm(arm_options: ArmOptions) -> Arm | None:
+    """Return the arm of the options, None without one. Raises ArmError."""
     model, urdf, tip = arm_options
-    if urdf is None and model is None:
+    if urdf is not None:
+        return arm_from_urdf(urdf, tip)
+    return None if model is None else builtin_arm(model)
+
+
+def _read_facts(link: LinkSettings, arm: Arm | None, arm_options: ArmOptions) -> ControllerFacts:
+    """Return what the controller reports by its profile; the arm's joints must be known."""
+    if arm is None:
         raise InputError(
             f"--model: found nothing with --driver {link.driver}, expected --model or --urdf "
             "FILE: its controller does not report which arm it moves"
         )
-    arm = arm_from_urdf(urdf, tip) if urdf is not None else builtin_arm(str(model))
     with make_driver(link, Model(arm=arm), clock=SYSTEM) as driver:
         try:
             return driver.facts(read_valid_state(driver))
         except InvalidStateError as error:
             if error.reason is not Implausible.VALUE:
                 raise
-            raise InputError(
-                f"{urdf or f'--model {model}'}: {error}{_link_keys_hint(link)}"
-            ) from None
+            named = arm_options.urdf or f"--model {arm_options.model}"
+            raise InputError(f"{named}: {error}{_link_keys_hint(link)}") from None
 
 
 def _link_keys_hint(link: LinkSettings) -> str:

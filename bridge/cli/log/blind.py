@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import signal
 import sys
 from pathlib import Path
 
@@ -36,6 +37,7 @@ def blind(context: click.Context, arguments: tuple[str, ...]) -> None:
             raise
         click.echo(context.get_help())
         return
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # else the pool of cases would finish first
     command.main(args=list(arguments), prog_name="gapbridge blind", standalone_mode=False)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from gapbridge.bridge import api
+from gapbridge.bridge.api.records import REPORT_FILES
 from gapbridge.bridge.cell.log_consistency import require_own_arm
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text, wrong_arm_findings
@@ -111,9 +112,6 @@ def diagnose(
         click.echo(f"{file}: written")
 
 
-REPORT_FILES = ("diagnosis.json", "report.html")  # in the folder of --out
-
-
 @dataclass(frozen=True)
 class _Output:
     """The output files of the command; None: not written."""
@@ -125,13 +123,13 @@ class _Output:
 
     def require_writable(self, *inputs: Path) -> None:
         """Create the folder; raise InputError if a file is not writable, or is an input."""
-        named = [] if self.out is None else [self.out / name for name in REPORT_FILES]
-        if self.json_file is not None:
-            named.append(require_writable(self.json_file, *inputs, *named))
-        if self.new_cell is not None:
-            require_cell(self.new_cell, *inputs, *named)
-        if self.out is not None:
+        files = [file for file in (self.json_file, self.new_cell) if file is not None]
+        if self.out is not None:  # first: the other files may be in it
             require_folder(self.out, "--out", above=False)
+            files = [*(self.out / name for name in REPORT_FILES), *files]
+        for number, file in enumerate(files):
+            check = require_cell if file is self.new_cell else require_writable
+            check(file, *inputs, *files[:number])
 
     def write(self, diagnosed: api.Diagnosed) -> list[Path]:
         """Write the requested files and return their paths."""

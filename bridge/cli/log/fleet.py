@@ -12,12 +12,13 @@ import click
 
 from gapbridge.bridge.cli.options import FILE, require_effects
 from gapbridge.bridge.cli.progress import progress
-from gapbridge.bridge.document.output_file import require_folder
+from gapbridge.bridge.document.output_file import require_folder, require_writable
 from gapbridge.bridge.fleet.cell_source import cell_source
 from gapbridge.bridge.fleet.journal import Journal
 from gapbridge.bridge.fleet.runner import FleetRun, make_tasks, run, summary_lines
 from gapbridge.bridge.fleet.session import (
     CELL_TABLE,
+    REPORT_FILE,
     RESULTS_FILE,
     SESSIONS_FILE,
     Fleet,
@@ -131,6 +132,7 @@ def fit(cells: Path | None, **values: Any) -> None:
     """
     if cells is not None:
         require_folder(cells, "--apply")
+        require_writable(cells / CELL_TABLE)
     options = FleetOptions(**values, cells=cells)
     done, sessions = _run("fit", fit_session, {}, options)
     from gapbridge.bridge.fleet.output import write_fit
@@ -150,6 +152,8 @@ def _run(
     for warning in cells.warnings():
         click.echo(f"warning: {warning}", err=True)
     require_folder(options.out, "--out")
+    for file in (RESULTS_FILE, SESSIONS_FILE, REPORT_FILE):
+        require_writable(options.out / file)
     tasks, bad = make_tasks(sessions.sessions, cells, job, job_options)
     count = min(workers or os.cpu_count() or 1, max(len(tasks), 1))
     pool: Workers = DaskWorkers(scheduler) if scheduler else LocalWorkers(count)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from gapbridge.bridge.document.blocks import Document, Part
 from gapbridge.bridge.document.html import html
-from gapbridge.bridge.document.output_file import write_text
 from gapbridge.bridge.document.provenance import origin_blocks, origin_line, provenance
 from gapbridge.bridge.fleet.diagnosis_summary import FleetDiagnosis
 from gapbridge.bridge.fleet.fit_summary import FleetFit
@@ -16,14 +15,11 @@ from gapbridge.bridge.fleet.runner import FleetRun
 from gapbridge.bridge.fleet.session import Fleet
 from gapbridge.bridge.report.labels import counted
 
-FILE = "report.html"
 DRIFTING = "Significant changes over the sessions of an arm."
 
 
-def write_diagnosis_report(
-    summary: FleetDiagnosis, done: FleetRun, fleet: Fleet, folder: Path
-) -> Path:
-    """Write the report of ``fleet diagnose`` and return its path."""
+def diagnosis_report(summary: FleetDiagnosis, done: FleetRun, fleet: Fleet) -> str:
+    """Return the report of ``fleet diagnose`` as HTML."""
     drifts = [*shared_sections.drifts(summary.drifts), *diagnosis_sections.onsets(summary.onsets)]
     parts = (
         Part("answer", "The answer", "", diagnosis_sections.answer(summary, done)),
@@ -36,11 +32,11 @@ def write_diagnosis_report(
              shared_sections.sessions(done, diagnosis_sections.SESSION_HEADS,
                                       diagnosis_sections.session_cells)),
     )  # fmt: skip
-    return _write(folder, "Diagnosis of a fleet", parts, done, fleet)
+    return _html("Diagnosis of a fleet", parts, done, fleet)
 
 
-def write_fit_report(summary: FleetFit, done: FleetRun, fleet: Fleet, folder: Path) -> Path:
-    """Write the report of ``fleet fit`` and return its path."""
+def fit_report(summary: FleetFit, done: FleetRun, fleet: Fleet) -> str:
+    """Return the report of ``fleet fit`` as HTML."""
     parts = (
         Part("answer", "The answer", "", fit_sections.answer(summary)),
         Part("types", "What arms of a type have in common",
@@ -55,11 +51,10 @@ def write_fit_report(summary: FleetFit, done: FleetRun, fleet: Fleet, folder: Pa
              shared_sections.sessions(done, fit_sections.SESSION_HEADS,
                                       fit_sections.session_cells(summary))),
     )  # fmt: skip
-    return _write(folder, "Compliance of a fleet", parts, done, fleet)
+    return _html("Compliance of a fleet", parts, done, fleet)
 
 
-def _write(folder: Path, title: str, parts: Sequence[Part], done: FleetRun, fleet: Fleet) -> Path:
-    path = folder / FILE
+def _html(title: str, parts: Sequence[Part], done: FleetRun, fleet: Fleet) -> str:
     cells = sorted({Path(o.cell) for o in done.outcomes if Path(o.cell).is_file()})
     # without the logs, which sessions.parquet lists
     origin = provenance({"cell": cells[: shared_sections.MAX_ROWS]})
@@ -69,5 +64,4 @@ def _write(folder: Path, title: str, parts: Sequence[Part], done: FleetRun, flee
         (*parts, Part("origin", "Where this comes from", "", origin_blocks(origin)[1:])),
         f"{title} · {origin_line(origin)}",
     )  # fmt: skip
-    write_text(path, html(document))
-    return path
+    return html(document)

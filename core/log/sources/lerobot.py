@@ -111,7 +111,7 @@ def _table(path: Path, episode: int | None, widths: dict[str, int]) -> dict[str,
     last = 0
     for file in files:
         try:
-            frame = parquet.read_table(file, columns=wanted)
+            frame = parquet.read_table(pyarrow.OSFile(bytes(file)), columns=wanted)
         except (pyarrow.ArrowException, OSError) as error:
             raise LogError(f"{file}: found no readable frames ({error})") from None
         if episode is not None:

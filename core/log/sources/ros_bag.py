@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gapbridge.core.errors import LogError, LogOptionError
+from gapbridge.core.files import require_utf8
 from gapbridge.core.log.sources.joint_order import order_joints
 from gapbridge.core.log.sources.resampling import Stream, joined
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
@@ -130,6 +131,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
             f"{path}: found a ROS bag, expected rosbags to be installed: pip install "
             "'gapbridge[ros]'"
         ) from None
+    require_utf8(path)
     try:
         bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         bag.open()

@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from click.testing import CliRunner
 
+from benchmarks.blind.__main__ import main
 from benchmarks.blind.cases import effects_of, group_of, kinds, make_case
 from benchmarks.blind.draws import POSITION_EFFECTS
 from benchmarks.blind.run import Command, DiagnosisError, Job, jobs_of, run_blind, run_job
@@ -202,3 +204,20 @@ def test_the_command_is_found_without_an_activated_environment(monkeypatch):
     first = Path(Command.parse("gapbridge diagnose").command[0])
     assert first.parent == Path(sys.executable).parent
     assert Command.parse("./mine diagnose").command == ("./mine", "diagnose")
+
+
+@pytest.mark.parametrize(
+    ("options", "phrase"),
+    [
+        (["--command", "/nonexistent diagnose"], "found no program '/nonexistent'"),
+        (["--out", "{}/file"], "file: found a file, expected a folder for --out"),
+        (["--out", "{}/taken"], "blind.html: found a folder"),
+    ],
+)
+def test_what_cannot_be_run_or_written_is_refused_before_the_first_case(options, phrase, tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "taken" / "blind.html").mkdir(parents=True)
+    result = CliRunner().invoke(main, [option.format(tmp_path) for option in options])
+    assert result.exit_code == 2
+    assert phrase in result.output
+    assert "first seed" not in result.output

@@ -157,7 +157,7 @@ def test_the_arm_moves_after_confirmation_and_ctrl_c_shows_how_to_resume(tmp_pat
                 terminal.type("yes")
         terminal.signal(signal.SIGINT)
         shown = terminal.wait_for_end()
-        assert terminal.code == 1
+        assert terminal.code == 130
     assert "the controller's payload is" not in shown  # the simulated tracker hangs each load
     assert "interrupted" in shown
     assert "to resume: gapbridge calibrate" in shown

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -408,12 +409,18 @@ def test_an_unforeseen_failure_is_one_line_and_a_file(
         raise ZeroDivisionError("by nothing")
 
     monkeypatch.setattr("gapbridge.bridge.cli.log.predict.open_cell", broken)
+    monkeypatch.setattr(sys, "argv", ["gapbridge", os.fsdecode(b"b\xff.csv")])
     ran = desk.run("predict", "@log.csv", "--cell", "@cell.yaml", "--out", "@o.csv")
     assert ran.code == 1
     assert ran.err.startswith("error: ZeroDivisionError: by nothing (details: ")
     details = Path(ran.err.rsplit(" ", 1)[1].rstrip(")\n"))
     assert "Traceback" in details.read_text()
+    assert r"gapbridge b\udcff.csv" in details.read_text()
     details.unlink()
+    monkeypatch.setattr(tempfile, "tempdir", str(desk.folder / "none"))
+    ran = desk.run("predict", "@log.csv", "--cell", "@cell.yaml", "--out", "@o.csv")
+    assert (ran.code, ran.err.count("\n")) == (1, 1)
+    assert ran.err.startswith("error: ZeroDivisionError: by nothing (no folder for details")
 
 
 # -- fit ----------------------------------------------------------------------------------------

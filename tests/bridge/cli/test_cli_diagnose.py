@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -64,6 +65,32 @@ def test_what_is_found_is_reported_written_and_predicts(tmp_path: Path) -> None:
     _, table = table_of(tmp_path / "p.csv")
     truth, rigid = SOFT.predict(q, loads).position, SOFT.rigid_pose(q).position
     assert np.abs(table[:, :3] - truth).max() < 0.05 * np.abs(rigid - truth).max()
+
+
+def test_names_that_are_not_utf8_are_escaped_in_every_document(tmp_path: Path) -> None:
+    log, new, folder = (tmp_path / os.fsdecode(b) for b in (b"b\xff.csv", b"n\xff.yaml", b"o\xff"))
+    soft_log(tmp_path).rename(log)
+    cell = cell_in(tmp_path)
+    answer = gapbridge("diagnose", log, "--cell", cell, "--out", folder, "--apply", new)
+    assert (answer.code, answer.err) == (0, "")
+    document = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    assert document["provenance"]["files"][0]["name"] == r"b\udcff.csv"
+    assert r"log b\udcff.csv" in (folder / "report.html").read_text(encoding="utf-8")
+    origin = load_cell(new).file.provenance
+    assert origin is not None
+    assert origin.files[0].name == r"b\udcff.csv"
+    assert origin.arguments["apply"] == str(tmp_path / r"n\udcff.yaml")
+
+
+def test_the_folder_of_the_report_may_hold_the_other_files(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    answer = gapbridge(
+        "diagnose", soft_log(tmp_path), "--cell", cell_in(tmp_path), "--out", folder,
+        "--json", folder / "gap.json", "--apply", folder / "better.yaml",
+    )  # fmt: skip
+    assert (answer.code, answer.err) == (0, "")
+    written = {"diagnosis.json", "report.html", "gap.json", "better.yaml"}
+    assert {path.name for path in folder.iterdir()} == written
 
 
 def test_a_reader_who_leaves_early_costs_no_file(
@@ -139,6 +166,8 @@ def test_stand_ins_go_into_the_cell_only_when_asked_for(
         (("--withhold", "backlsh"), ["--withhold", "'backlsh'", "did you mean 'backlash'"]),
         (("--out", "{}/none/out"), ["found no folder", "none"]),
         (("--out", "{}/log.csv"), ["found a file", "expected a folder"]),
+        (("--out", "{}/taken"), ["taken/report.html: found a folder"]),
+        (("--out", "{}/o", "--json", "{}/o/report.html"), ["o/report.html: found for two outputs"]),
         (("--json", "{}/none/d.json"), ["found no folder"]),
         (("--apply", "{}/cell.yaml"), ["output to be the input"]),
         (("--apply", "{}"), ["found a folder"]),
@@ -151,6 +180,7 @@ def test_unusable_options_are_refused_before_any_work(
     tmp_path: Path, options: tuple[str, ...], words: list[str]
 ) -> None:
     log = soft_log(tmp_path)
+    (tmp_path / "taken" / "report.html").mkdir(parents=True)
     (tmp_path / "short.csv").write_text("payload\n1\n2\n3\n", encoding="utf-8")
     given = [option.format(tmp_path) for option in options]
     line = refused("diagnose", log, "--cell", cell_in(tmp_path), *given)

@@ -167,3 +167,17 @@ def test_host_is_an_interface_a_serial_port_or_an_address(
 def test_a_cell_is_a_yaml_file(tmp_path: Path) -> None:
     line = refused("init", "127.0.0.1", "--out", tmp_path / "cell.csv")
     assert "cell.csv: found .csv, expected .yaml or .yml" in line
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "phrase"),
+    [("--urdf", "none.urdf", "file not found"), ("--model", "ur99", "found 'ur99'")],
+)
+def test_the_arm_is_looked_at_before_the_controller_is_reached(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str, value: str, phrase: str
+) -> None:
+    def reached(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("gapbridge.bridge.cli.cell.init.enquire", reached)
+    assert phrase in refused("init", "127.0.0.1", option, value, "--out", tmp_path / "new.yaml")

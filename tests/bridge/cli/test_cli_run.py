@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +16,7 @@ from cli_runs import cell_in, gapbridge, refused
 
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cli.log.blind import benchmark
+from gapbridge.bridge.document.output_file import replacing
 from gapbridge.core.errors import LinkError
 
 
@@ -54,7 +57,42 @@ def test_an_interrupt_ends_without_a_traceback(
 
     daemon(monkeypatch, run_cell)
     answer = gapbridge("run", cell_in(tmp_path))
-    assert (answer.code, answer.err.strip()) == (1, "error: interrupted")
+    assert (answer.code, answer.err.strip()) == (130, "error: interrupted")
+
+
+@pytest.fixture
+def default_sigterm() -> Iterator[None]:
+    """The handler of a fresh process: another command may have left its own."""
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.usefixtures("default_sigterm")
+def test_sigterm_ends_a_command_as_an_interrupt_does_and_leaves_no_partial_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(path: Path, *_: object) -> None:
+        with replacing(path) as file:
+            file.write("half")
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("gapbridge.bridge.cli.cell.patch.write_text", write)
+    model, cell = tmp_path / "arm.urdf", tmp_path / "cell.yaml"
+    shutil.copy(Path(__file__).parents[3] / "config" / "piper.urdf", model)
+    cell.write_text("robot: {urdf: arm.urdf, tip: link6}\n", encoding="utf-8")
+    answer = gapbridge("patch", model, "--cell", cell, "--out", tmp_path / "new.urdf")
+    assert (answer.code, answer.err.strip()) == (143, "error: terminated")
+    assert sorted(tmp_path.iterdir()) == [model, cell]
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@pytest.mark.usefixtures("default_sigterm")
+def test_the_daemon_keeps_its_own_sigterm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[object] = []
+    daemon(monkeypatch, lambda cell, **_: seen.append(signal.getsignal(signal.SIGTERM)))
+    assert gapbridge("run", cell_in(tmp_path)).code == 0
+    assert seen == [signal.SIG_DFL]
 
 
 LOADING = """
@@ -94,7 +132,7 @@ def test_an_interrupt_while_the_command_is_imported_is_one_line() -> None:
         [sys.executable, "-c", IMPORTING], capture_output=True, text=True, check=False,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell may ignore it
     )  # fmt: skip
-    assert (ran.returncode, ran.stderr.strip()) == (1, "error: interrupted")
+    assert (ran.returncode, ran.stderr.strip()) == (130, "error: interrupted")
 
 
 def test_an_interrupt_waits_until_machine_code_is_loaded() -> None:
@@ -104,7 +142,7 @@ def test_an_interrupt_waits_until_machine_code_is_loaded() -> None:
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell may ignore it
     )  # fmt: skip
     assert ran.stdout == "loaded\n"
-    assert (ran.returncode, ran.stderr.strip()) == (1, "error: interrupted")
+    assert (ran.returncode, ran.stderr.strip()) == (130, "error: interrupted")
 
 
 def test_observing_and_writing_exclude_each_other(tmp_path: Path) -> None:

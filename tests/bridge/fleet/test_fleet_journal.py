@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -50,6 +52,18 @@ def test_two_runs_do_not_write_one_journal(tmp_path: Path) -> None:
     path = tmp_path / "j.jsonl"
     with Journal(path, clock=SYSTEM), pytest.raises(RunError, match="another run writes it"):
         Journal(path, clock=SYSTEM)
+
+
+def test_a_disk_that_is_full_names_the_journal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    journal = Journal(tmp_path / "j.jsonl", clock=SYSTEM)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(RunError, match=r"j\.jsonl: cannot be written: No space left"), journal:
+        pass
 
 
 def test_fresh_forgets(tmp_path: Path) -> None:

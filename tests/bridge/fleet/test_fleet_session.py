@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
 import pytest
 
 from gapbridge.bridge.fleet.cell_source import CellNearLog, CellTable, OneCell, cell_source
-from gapbridge.bridge.fleet.session import Fleet, find_sessions
+from gapbridge.bridge.fleet.output import (
+    DIAGNOSIS_COLUMNS,
+    EFFECT_COLUMNS,
+    FIT_COLUMNS,
+    FLEXIBILITY_COLUMNS,
+    parquet,
+    session_rows,
+)
+from gapbridge.bridge.fleet.runner import make_tasks
+from gapbridge.bridge.fleet.session import RESULTS_FILE, SESSIONS_FILE, Fleet, find_sessions
+from gapbridge.bridge.fleet.task import BAD
 from gapbridge.core.errors import InputError
+from tests.bridge.fleet.jobs import count_rows
 
 
 def files_in(folder: Path, *names: str) -> Path:
@@ -66,6 +78,28 @@ def test_a_runs_tables_are_no_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert list(arms_of(find_sessions(["."], without=tables))) == ["a/s", "out/s"]
     with pytest.raises(InputError, match="found only tables of a run, expected logs"):
         find_sessions(["cells.csv"], without=tables)
+
+
+def test_tables_of_an_earlier_run_are_no_logs_of_the_next(tmp_path: Path) -> None:
+    files_in(tmp_path, "a/s.csv", "b/results.parquet")  # the latter of somebody else
+    (tmp_path / "out").mkdir()
+    for name, columns in ((RESULTS_FILE, FLEXIBILITY_COLUMNS), (SESSIONS_FILE, FIT_COLUMNS)):
+        (tmp_path / "out" / name).write_bytes(parquet(columns, []))
+    (tmp_path / "cells.csv").write_text("arm,cell\na,a.yaml\n")
+    assert list(arms_of(find_sessions([str(tmp_path)]))) == ["a/s", "b/results"]
+    for columns in (EFFECT_COLUMNS, DIAGNOSIS_COLUMNS):
+        (tmp_path / "b" / RESULTS_FILE).write_bytes(parquet(columns, []))
+        assert list(arms_of(find_sessions([str(tmp_path)]))) == ["a/s"]
+
+
+def test_a_log_whose_name_is_not_utf8_is_skipped(tmp_path: Path) -> None:
+    files_in(tmp_path, os.fsdecode(b"a/s\xff.csv"), "a/t.csv", "cell.yaml")
+    sessions = find_sessions([str(tmp_path / "a")]).sessions
+    tasks, [bad] = make_tasks(sessions, OneCell(tmp_path / "cell.yaml"), count_rows, {})
+    assert [task.log.name for task in tasks] == ["t.csv"]
+    assert (bad.state, bad.session) == (BAD, r"s\udcff")
+    assert r"s\udcff.csv: found a name that is not UTF-8" in bad.error
+    parquet(FIT_COLUMNS, list(session_rows([bad])))
 
 
 @pytest.mark.parametrize(

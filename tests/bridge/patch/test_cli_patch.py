@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -62,6 +63,20 @@ def test_a_tie_is_a_comment_with_both_candidates(folder: Path, model: str) -> No
     assert "latency_4" in tied[1]
     assert "tracking_lag" in tied[1]
     assert done.out.count("tie:") == 2
+
+
+def test_names_that_are_not_utf8_are_escaped_or_refused(folder: Path) -> None:
+    cell, model = (folder / os.fsdecode(name) for name in (b"c\xff.yaml", b"m\xff.xml"))
+    (folder / "cell.yaml").rename(cell)
+    (folder / "arm.xml").rename(model)
+    for given in ("arm.urdf", model):
+        out = folder / f"out{Path(given).suffix}"
+        done = gapbridge("patch", folder / given, "--cell", cell, "--out", out)
+        if given != model:
+            assert done.code == 0, done.err
+            assert r"cell: c\udcff.yaml" in out.read_text(encoding="utf-8")
+    assert done.code == 2  # MuJoCo takes no such name
+    assert "found a name that is not UTF-8, expected one that is" in done.err
 
 
 def test_what_was_not_accused_is_never_written(folder: Path) -> None:

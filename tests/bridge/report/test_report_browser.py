@@ -9,7 +9,7 @@ from on_a_phone import CUT
 from patience import PATIENCE, wait_for
 from report_cases import CASES, diagnosed
 
-from gapbridge.bridge.report import write_report
+from gapbridge.bridge.report import report_text
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -58,8 +58,9 @@ def explained(tmp_path_factory):
 
 def _written(name, tmp_path_factory):
     c = diagnosed(name)
-    folder = tmp_path_factory.mktemp("report")
-    return write_report(c.diagnosis, "<b>Cell</b> 7 & co", c.log, c.model, folder)
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    path.write_text(report_text(c.diagnosis, "<b>Cell</b> 7 & co", c.log, c.model), "utf-8")
+    return path
 
 
 def test_every_figure_draws_and_nothing_is_complained_about_or_fetched(browser, report):

@@ -1,6 +1,8 @@
 """The report of a calibration: one page and one PDF of the same document."""
 
+import os
 import re
+from pathlib import Path
 
 import pypdfium2
 import pytest
@@ -60,6 +62,14 @@ def test_names_in_other_scripts_are_not_lost(tmp_path):
     for name in (*names.values(), "机器人 3"):
         assert name in html
         assert name in phrase
+
+
+def test_a_name_that_is_not_utf8_is_escaped_in_both(tmp_path):
+    facts = session(cell=os.fsdecode(b"c\xff"), folder=Path(os.fsdecode(b"s\xff")))
+    page, paper = write_report(CalibrationData(calibration(), None, facts), tmp_path)
+    for text in (page.read_text("utf-8"), text_of(paper)):
+        assert r"Calibration of c\udcff" in text
+        assert r"s\udcff" in text
 
 
 def test_nothing_is_loaded_from_outside(written):

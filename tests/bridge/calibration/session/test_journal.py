@@ -107,6 +107,12 @@ def test_an_entry_that_did_not_fit_on_the_disk_leaves_the_journal_as_it_was(
     assert [entry["text"] for entry in read_entries(tmp_path / FILE)] == ["before", "after"]
 
 
+def test_a_folder_that_takes_no_journal_is_unusable_input(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"journal\.jsonl: cannot be written: Not a directory"):
+        Journal(tmp_path / "file" / "s").open()
+
+
 @given(st.integers(0, 400))
 @settings(max_examples=40, deadline=None)
 def test_a_journal_that_is_cut_anywhere_keeps_every_whole_line(cut: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gapbridge.core.errors import LogError
+from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.sources import SourceOptions, source_of
 from gapbridge.core.log.sources.joint_order import UR_JOINTS, order_joints
 from gapbridge.core.notes import Reason
@@ -284,6 +285,13 @@ def test_a_broken_bag_is_one_clear_line(tmp_path: Path) -> None:
     path = tmp_path / "broken.bag"
     path.write_bytes(b"#ROSBAG V2.0\nnot really")
     with pytest.raises(LogError, match=r"broken.bag: found no readable bag"):
+        source_of(path).read(path, UR_JOINTS, SourceOptions())
+
+
+def test_a_name_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode(b"b\xff.db3")
+    path.write_bytes(b"SQLite format 3\0")
+    with pytest.raises(InputError, match="found a name that is not UTF-8, expected one that is"):
         source_of(path).read(path, UR_JOINTS, SourceOptions())
 
 
