@@ -16,6 +16,7 @@ LEVER = 0.3  # m, of that force, or of the heaviest payload, from the flange
 MASS_SHARE = 0.5  # of the links' mass, as the rated payload where it is unknown
 DEFAULT_RATED = 10.0  # kg, rated payload where the links' masses are unknown too
 GRAVITY = 9.80665  # m/s^2
+LEAST = -1e-9  # kg, of declared mass and effects together: less than zero by rounding alone
 
 
 @dataclass(frozen=True)

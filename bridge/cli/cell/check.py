@@ -77,7 +77,9 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
 
 
 def _further_findings(cell: Cell) -> Iterator[Findings]:
-    """Yield what only predict, calibrate or run would refuse: names, places, files."""
+    """Yield what only predict, calibrate or run would refuse: loads, names, places, files."""
+    if (problem := cell.payload_problem) is not None:
+        yield Findings([str(problem)], [])
     try:
         if cell.spread.names:
             parameters_named(cell.model, cell.spread.names, "provenance")

@@ -176,6 +176,18 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
             "order: found 2", "none for backlash",
         ),
         (ARM + "effects: [{effect: transmission_error, joint: 2}]", "found none", "per turn"),
+        (
+            ARM + "effects: [{effect: transmission_error, joint: 2, order: -3}]",
+            "effects entry 1.order: found -3", "more than 0",
+        ),
+        (
+            ARM + "effects: [{effect: transmission_error, joint: 2, order: 1e9}]",
+            "effects entry 1.order: found 1000000000.0", "100000 or less",
+        ),
+        (
+            ARM + "effects:\n" + 2 * "- {effect: backlash, joint: 1, parameters: {value: 1e-3}}\n",
+            "line 4: effects entry 2: found the same backlash as in entry 1", "it once",
+        ),
         (ARM + "metrology: {registered: 1}", "found 1", "true or false"),
         (ARM + "metrology: {sigma: -1}", "found -1", "0 or more"),
         (ARM + "link: {host: '10.0.0.2:30004'}", "'10.0.0.2:30004'", "without a port"),
