@@ -50,6 +50,4 @@ def read_profile_file(path: Path, schema: type[Schema]) -> tuple[ProfileDocument
         return document, schema.model_validate(document.data)
     except ValidationError as error:
         keys, text = validation_errors(schema, error)[0]
-        raise (
-            ProfileError(f"{path}: {text}") if keys is None else document.error(keys, text)
-        ) from None
+        raise document.error(keys, text) from None
