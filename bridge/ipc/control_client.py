@@ -8,6 +8,7 @@ import socket
 from pathlib import Path
 from typing import Any
 
+from gapbridge.bridge.cell.document import read_document
 from gapbridge.bridge.cell.runtime_folder import candidates, cell_key
 from gapbridge.core.errors import InputError, RunError
 
@@ -30,6 +31,8 @@ def ask(cell: Path, command: str) -> Any:
             refused = f"{folder / name}: found a daemon of another user, expected your own"
         except OSError:
             continue
+    if not refused:
+        read_document(cell)  # raises for what is no cell
     raise InputError(refused or f"{cell}: found no running daemon, expected one: gapbridge run")
 
 

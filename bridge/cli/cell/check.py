@@ -17,12 +17,9 @@ from gapbridge.bridge.cell.plausibility import Findings
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cell.verification_mark import read_mark
 from gapbridge.bridge.cli.options import FILE, cell_argument
-from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.core.calibration.spread import parameters_named
 from gapbridge.core.errors import InputError
-from gapbridge.drivers import make_driver
 from gapbridge.drivers.clock import SYSTEM
-from gapbridge.drivers.link_settings import ProfileSettings
 
 
 @click.command()
@@ -103,20 +100,14 @@ def _run_findings(cell: Cell) -> Findings:
         text = f"joint {i + 1}: found limits {limits.lower[i]:g} to {limits.upper[i]:g} rad"
         line = message_at(cell.document, ("robot",), f"{text}, expected lower below upper")
         return Findings([line], [])
+    from gapbridge.bridge.daemon.runnable import require_runnable
+
     try:
         settings = read_configuration(cell.path).settings
-        if isinstance(settings.link, ProfileSettings):
-            make_driver(
-                settings.link, cell.model, clock=SYSTEM
-            )  # checks the profile against the arm
+        require_runnable(cell, settings, SYSTEM)
     except InputError as error:
         return Findings([located_message(cell.document, error)], [])
     setpoints, rate = settings.setpoints, settings.link.rate
-    try:
-        make_source(setpoints, cell.arm.n, True, cell.path.parent, SYSTEM, rate)
-    except InputError as error:
-        keys = error.keys or ("setpoints", "file")
-        return Findings([message_at(cell.document, keys, error.message)], [])
     if setpoints.source != "trajectory":
         return Findings([], [])
     from gapbridge.bridge.cli.cell.trajectory_check import trajectory_findings

@@ -238,6 +238,10 @@ def test_every_command_refuses_it_in_one_line(tmp_path: Path) -> None:
         ("link: {driver: can, profile: openarm}", "line 2: link.profile: found 7 joints in"),
         ("link: {host: 127.0.0.2}\nsetpoints: {source: trajectory}",
          "line 3: setpoints.file: found nothing"),
+        ("link: {driver: replay, file: cell.yaml}",
+         "line 2: link.file: {folder}/cell.yaml: found no MCAP file"),
+        ("link: {driver: modbus, profile: none.yaml}",
+         "line 2: link.profile: {folder}/none.yaml: file not found, expected a profile"),
         ("calibration: {joint_range: {lower: [0], upper: [1]}}",
          "line 2: calibration.joint_range.lower: found 1 values, expected 6"),
         ("calibration: {joint_range: {lower: [0, 2, 0, 0, 0, 0], upper: [1, 1, 1, 1, 1, 1]}}",
@@ -257,7 +261,25 @@ def test_what_only_a_run_would_refuse_is_named_with_its_line(
     tmp_path: Path, lines: str, message: str
 ) -> None:
     path = cell_of(tmp_path, lines)
-    assert f"error: {path}, {message}" in refused("check", path)
+    assert f"error: {path}, {message.replace('{folder}', str(tmp_path))}" in refused("check", path)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        "link: {driver: replay, file: cell.yaml}",
+        "link: {host: 127.0.0.2}\nsetpoints: {source: trajectory, file: cell.yaml}",
+    ],
+)
+def test_a_run_that_cannot_begin_leaves_no_recording(tmp_path: Path, lines: str) -> None:
+    path = cell_of(tmp_path, lines + "\nrecording: {folder: recordings}")
+    assert f": {tmp_path}/cell.yaml: " in refused("run", path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_no_cell_cannot_be_armed(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("timestamp\n0\n")
+    assert "log.csv, line 1: found no keys, expected a cell" in refused("arm", tmp_path / "log.csv")
 
 
 @pytest.mark.parametrize(
