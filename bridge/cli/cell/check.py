@@ -10,7 +10,7 @@ import numpy as np
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.cell import cell_errors
-from gapbridge.bridge.cell.live import live_findings
+from gapbridge.bridge.cell.live import compare_live
 from gapbridge.bridge.cell.log_consistency import log_findings
 from gapbridge.bridge.cell.message import located_message, message_at
 from gapbridge.bridge.cell.plausibility import Findings
@@ -37,11 +37,11 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
     """Check a cell file for mistakes, and report each with its line.
 
     Checks units by plausible magnitude (m, rad, kg, °C), reach, masses and limits; an impossible
-    value is an error, an unusual one a warning. With --live also compares TCP, payload, gravity,
-    geometry and rate with the controller. With --log also compares the arm with measured poses; if
-    they do not agree, common mistakes are tried (modified DH rows, a sign, inches, the order of
-    joints, frames), and the one that explains them is reported. Exits with 0 if there is no error,
-    2 otherwise.
+    value is an error, an unusual one a warning. With --live also shows TCP, payload, gravity,
+    geometry and rate beside the controller's, and compares them; what arming would refuse is an
+    error. With --log also compares the arm with measured poses; if they do not agree, common
+    mistakes are tried (modified DH rows, a sign, inches, the order of joints, frames), and the one
+    that explains them is reported. Exits with 0 if there is no error, 2 otherwise.
 
     Example: gapbridge check cell.yaml --live
     """
@@ -54,9 +54,11 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
             errors += findings.errors
             warnings += findings.warnings
         if live and not errors:
-            findings = live_findings(opened, SYSTEM)
-            errors += findings.errors
-            warnings += findings.warnings
+            compared = compare_live(opened, SYSTEM)
+            errors += compared.errors
+            warnings += compared.warnings
+            for line in compared.table:
+                click.echo(line)
         for log in logs if not errors else ():
             findings = log_findings(opened, log)
             errors += findings.errors
@@ -68,8 +70,8 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
     if errors:
         raise click.exceptions.Exit(2)
     count = f", {len(warnings)} warning{'s' * (len(warnings) != 1)}" if warnings else ""
-    compared = [*["its controller"] * live, *map(str, logs)]
-    text = f" with {' and '.join(compared)}" if compared else ""
+    beside = [*["its controller"] * live, *map(str, logs)]
+    text = f" with {' and '.join(beside)}" if beside else ""
     click.echo(f"{cell}: fit to be used{text}{count}")
 
 

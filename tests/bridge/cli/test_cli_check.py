@@ -395,13 +395,36 @@ def test_live_reports_where_the_controller_differs(host: str, tmp_path: Path) ->
     assert "line 1: robot.calibration: found geometry up to" in answer.err
 
 
-def test_a_rate_that_the_controller_has_not_is_one_warning(host: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("rate", "code", "text"),
+    [
+        (700, 0, "warning: {0}, line 4: link.rate: found 700 Hz, expected at most 500 Hz"),
+        (900, 2, "error: {0}, line 4: link.rate: found 900 Hz, expected at most 500 Hz: the contr"),
+    ],
+)
+def test_a_rate_that_the_controller_has_not_is_refused_as_arming_does(
+    host: str, tmp_path: Path, rate: int, code: int, text: str
+) -> None:
     path = cell(tmp_path, host)
-    path.write_text(path.read_text().replace(f"host: {host}", f"host: {host}, rate: 1000"))
-    warned = [line for line in gapbridge("check", path, "--live").err.splitlines()
-              if "link.rate" in line]  # fmt: skip
-    assert len(warned) == 1
-    assert "expected at most 500 Hz" in warned[0]
+    path.write_text(path.read_text().replace(f"host: {host}", f"host: {host}, rate: {rate}"))
+    answer = gapbridge("check", path, "--live")
+    (line,) = (line for line in answer.err.splitlines() if "link.rate" in line)
+    assert (answer.code, line.startswith(text.format(path))) == (code, True), line
+
+
+def test_live_shows_the_values_of_both_side_by_side(host: str, tmp_path: Path) -> None:
+    path = cell(tmp_path, host, "0.25")
+    path.write_text(path.read_text().replace("mass: 5", "mass: 2"))
+    shown = {line[:13].strip(): line[13:].split("  ") for line in
+             gapbridge("check", path, "--live").out.splitlines()}  # fmt: skip
+    found = {name: (values[0], values[-1].strip()) for name, values in shown.items()}
+    assert found["quantity"] == ("cell", "controller")
+    assert found["TCP xyz"] == ("[0, 0, 0.25] m", "[0, 0, 0.18] m")
+    assert found["payload"] == ("2 kg", "5 kg")
+    assert found["calibration"][0] == "none"
+    assert found["calibration"][1].startswith("flange within 0.")
+    assert found["rate"][0] == "500 Hz"
+    assert found["rate"][1].startswith("500 Hz, measured ")
 
 
 def test_live_passes_the_controllers_own_cell(host: str, tmp_path: Path) -> None:
