@@ -8,7 +8,6 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from gapbridge.bridge.cell.document import read_document
 from gapbridge.bridge.cell.runtime_folder import candidates, cell_key
 from gapbridge.core.errors import InputError, RunError
 
@@ -32,6 +31,8 @@ def ask(cell: Path, command: str) -> Any:
         except OSError:
             continue
     if not refused:
+        from gapbridge.bridge.cell.document import read_document  # brings yaml
+
         read_document(cell)  # raises for what is no cell
     raise InputError(refused or f"{cell}: found no running daemon, expected one: gapbridge run")
 
