@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -24,6 +25,7 @@ import yaml
 from gapbridge.core.errors import InputError, Keys
 
 MAX_QUOTED = 60  # characters of a value that a message quotes
+MAX_DIGITS = 1000  # of a whole number; Python converts no more than 4300
 
 _INTEGER = re.compile(
     r"^[-+]?(?:0b[0-1_]+|0x[0-9a-fA-F_]+|0|[1-9][0-9_]*)$"  # 010, 1:30: texts
@@ -216,7 +218,9 @@ def parse_yaml(text: str, path: Path, kind: Kind) -> Document:
                 text = text_of_problem.format(name=kind.name)
                 raise kind.error(f"{path}, line {line}: {text}") from None
         raise kind.error(f"{path}, line {line}: found broken YAML: {what}") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except RecursionError:
+        raise kind.error(f"{path}: found values nested too deep, expected a few levels") from None
+    except (yaml.YAMLError, ValueError) as error:
         what = " ".join(str(error).split())
         raise kind.error(f"{path}: found broken YAML: {what}") from None
     return Document(path, text, root, data)
@@ -250,18 +254,25 @@ def read_yaml(path: Path, kind: Kind) -> Document:
 
 
 def _require_plain(node: yaml.Node, path: Path, kind: Kind, seen: set[int]) -> None:
-    """Raise the kind's error for a key that comes twice, and for NUL, which no path may have."""
+    """Raise the kind's error for a key that comes twice, and for what no value can have.
+
+    That is NUL, which no path may have, a decimal comma, and digits without an end.
+    """
     if id(node) in seen:
         return
     seen.add(id(node))
     if isinstance(node, yaml.ScalarNode) and "\0" in node.value:
         line = node.start_mark.line + 1
         raise kind.error(f"{path}, line {line}: found {quoted(node.value)}, expected no \\0 in it")
+    if node.tag == "tag:yaml.org,2002:int" and len(node.value) > MAX_DIGITS:
+        line = node.start_mark.line + 1
+        raise kind.error(f"{path}, line {line}: found {quoted(node.value)}, expected fewer digits")
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
             _require_plain(item, path, kind, seen)
     elif isinstance(node, yaml.MappingNode):
         keys: set[str] = set()
+        _require_decimal_points(node, path, kind)
         for key, value in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value != "<<":
                 if key.value in keys:
@@ -271,3 +282,20 @@ def _require_plain(node: yaml.Node, path: Path, kind: Kind, seen: set[int]) -> N
                     )
                 keys.add(key.value)
             _require_plain(value, path, kind, seen)
+
+
+def _require_decimal_points(node: yaml.MappingNode, path: Path, kind: Kind) -> None:
+    """Raise the kind's error for ``{mass: 5,5}``, which YAML reads as {mass: 5, 5: null}."""
+    for (name, whole), (decimals, rest) in itertools.pairwise(node.value):
+        if (
+            rest.value == ""
+            and isinstance(whole, yaml.ScalarNode)
+            and re.fullmatch(r"[-+]?\d+", whole.value)
+            and isinstance(decimals, yaml.ScalarNode)
+            and re.fullmatch(r"\d+([eE][-+]?\d+)?", decimals.value)
+        ):
+            raise kind.error(
+                f"{path}, line {whole.start_mark.line + 1}: {name.value}: found a decimal comma "
+                f"({whole.value},{decimals.value}), expected a point ({whole.value}."
+                f"{decimals.value})"
+            )

@@ -18,6 +18,7 @@ DEFAULT_RATED = 10.0  # kg, rated payload where the links' masses are unknown to
 GRAVITY = 9.80665  # m/s^2
 MAX_FORCE, MAX_MOMENT = 1e4, 1e4  # N, Nm on a tool: no arm is pushed harder
 WRENCH = (MAX_FORCE,) * 3 + (MAX_MOMENT,) * 3
+LEAST = -1e-9  # kg, of declared mass and effects together: less than zero by rounding alone
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,11 @@ class Model:
         """Return the length of the stretched arm with its tool (m)."""
         return self.arm.length + float(np.linalg.norm(self.tool_in_flange[:3, 3]))
 
+    @property
+    def added_mass(self) -> float:
+        """Return what the terms add to the declared payload (kg)."""
+        return sum(t.values[0] for t in self.terms if CATALOGUE[t.effect].adds_mass)
+
     def with_terms(self, terms: Sequence[Term]) -> Model:
         """Return the model with further effects in it."""
         return replace(self, terms=self.terms + tuple(terms))

@@ -82,6 +82,12 @@ def implausible_in_arm(arm: Arm, keys: tuple[str | int, ...]) -> Iterator[Implau
             yield Implausible(
                 keys, f"a centre of gravity of link {i + 1} {distance:.4g} m off", "m (mm?)"
             )
+        inertia = float(np.abs(arm.inertia[i]).max())
+        if inertia > MAX_MASS * MAX_REACH**2 or inertia > mass * (2.0 * reach_m + 1.0) ** 2 > 0:
+            yield Implausible(
+                keys, f"{inertia:.4g} kg m2, inertia of link {i + 1}", "kg m2 (g mm2?): less than "
+                "its mass has at that reach", sure=inertia > MAX_MASS * MAX_REACH**2,
+            )  # fmt: skip
     if (mass := float(arm.mass.sum())) > MAX_DENSITY * reach_m**3 and mass > LARGE_MASS:
         yield Implausible(keys, f"an arm of {mass:.4g} kg and {reach_m:.3g} m reach", "kg (grams?)")
     massless = [str(i + 1) for i in range(arm.n) if arm.mass[i] == 0]

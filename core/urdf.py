@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -10,7 +11,7 @@ import numpy as np
 
 from gapbridge.core.arm import Arm, JointLimits
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import ArmError
+from gapbridge.core.errors import ArmError, first_line
 from gapbridge.core.files import read_text
 from gapbridge.core.rotation import rotation_matrix, rpy_matrix, transform
 
@@ -58,13 +59,23 @@ def arm_from_urdf(path: Path | str, tip: str | None = None) -> Arm:
 
 def _parse(path: Path) -> ElementTree.Element:
     try:
-        root = ElementTree.fromstring(read_text(path))
+        return checked_urdf(path, read_text(path))
     except FileNotFoundError:
         raise ArmError(f"{path}: robot.urdf: file not found") from None
     except UnicodeDecodeError:
         raise ArmError(f"{path}: found bytes that are no text, expected a URDF (UTF-8)") from None
     except OSError as error:
-        raise ArmError(f"{path}: robot.urdf: cannot be read: {error}") from None
+        raise ArmError(f"{path}: robot.urdf: cannot be read: {first_line(error)}") from None
+
+
+def checked_urdf(path: Path, text: str) -> ElementTree.Element:
+    """Return the root of a URDF whose links and joints are a tree; ``path`` is for messages.
+
+    Raises ArmError for broken XML, for what is no URDF, and where names or links contradict each
+    other.
+    """
+    try:
+        root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise ArmError(f"{path}: found broken XML ({error}), expected a URDF") from None
     if root.tag != "robot":
@@ -74,7 +85,13 @@ def _parse(path: Path) -> ElementTree.Element:
             f"{path}: found xacro macros, expected a plain URDF (ros2 run xacro xacro {path.name} "
             "-o robot.urdf)"
         )
+    for kind in ("link", "joint"):
+        names = [str(element.get("name")) for element in root.findall(kind)]
+        if twice := next((name for i, name in enumerate(names) if name in names[:i]), None):
+            raise ArmError(f"{path}: {kind} {twice!r}: found twice, expected once")
     links = {str(link.get("name")) for link in root.findall("link")}
+    if not links:
+        raise ArmError(f"{path}: found no links, expected those of an arm")
     moved_by: dict[str, str | None] = {}  # by the joint that turns or holds it
     for joint in root.findall("joint"):
         label = f"{path}: joint {joint.get('name')!r}"
@@ -89,7 +106,21 @@ def _parse(path: Path) -> ElementTree.Element:
                 f"{moved_by[_child(joint)]!r} does not move already"
             )
         moved_by[_child(joint)] = joint.get("name")
+    _require_tree(path, {_child(joint): _parent(joint) for joint in root.findall("joint")})
     return root
+
+
+def _require_tree(path: Path, parents: dict[str, str]) -> None:
+    """Raise ArmError for links in a closed loop; ``parents``: each link's, by its name."""
+    held: set[str] = set()  # by a root
+    for link in parents:
+        above: set[str] = set()
+        while link in parents and link not in held:
+            if link in above:
+                raise ArmError(f"{path}: link {link!r}: found a closed loop, expected a tree")
+            above.add(link)
+            link = parents[link]
+        held |= above
 
 
 def _only_leaf(
@@ -169,7 +200,7 @@ def _arm(
             declared = limit is not None and not free and limit.get(key) is not None
             columns[key].append(_vector(limit, key, "0", label)[0] if declared else default)
         for key in ("velocity", "effort"):
-            value = _vector(limit, key, "0", label)[0]
+            value = _not_negative(limit, key, label)
             columns[key].append(value if value > 0 else np.inf)
     limits = JointLimits(**{key: np.array(values) for key, values in columns.items()})
     names = tuple(str(j.get("name")) for j in moving)
@@ -213,7 +244,10 @@ def _link(path: Path, link: ElementTree.Element, frame: Array) -> _Body:
     if tensor is not None:
         for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
             key = "i" + "xyz"[i] + "xyz"[j]
-            about_centre[i, j] = about_centre[j, i] = _vector(tensor, key, "0", label)[0]
+            number = _not_negative(tensor, key, label) if i == j else (
+                _vector(tensor, key, "0", label)[0]
+            )  # fmt: skip
+            about_centre[i, j] = about_centre[j, i] = number
     R, c = pose[:3, :3], pose[:3, 3]
     return _Body(mass, mass * c, R @ about_centre @ R.T + mass * _point(c))
 
@@ -225,8 +259,9 @@ def _point(c: Array) -> Array:
 
 def _axis(joint: ElementTree.Element, label: str) -> Array:
     axis = _vector(joint.find("axis"), "xyz", "1 0 0", label)
-    if not axis.any():
-        raise ArmError(f"{label}: axis xyz: found '0 0 0', expected a direction")
+    if not 1e-6 <= math.hypot(*axis) <= 1e6:
+        found = " ".join(f"{v:g}" for v in axis)
+        raise ArmError(f"{label}: axis xyz: found {found!r}, expected a direction")
     return axis
 
 
@@ -247,6 +282,14 @@ def _vector(element: ElementTree.Element | None, key: str, default: str, label: 
             f"{label}: {key}: found {text!r}, expected {len(default.split())} finite number(s)"
         )
     return values
+
+
+def _not_negative(element: ElementTree.Element | None, key: str, label: str) -> float:
+    """Return a number of 0 or more; 0 where it is left out."""
+    value = float(_vector(element, key, "0", label)[0])
+    if value < 0.0:
+        raise ArmError(f"{label}: {key}: found {value:g}, expected 0 or more")
+    return value
 
 
 def _align_z(axis: Array) -> Array:

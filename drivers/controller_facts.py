@@ -70,17 +70,22 @@ def differences(
     return result
 
 
+def flange_apart(facts: ControllerFacts, arm: Arm) -> float | None:
+    """Return how far (m) an arm's flange is from the controller's, in the best-fitting base frame.
+
+    None where the controller reports no geometry, or one of other joints.
+    """
+    if facts.arm is None or facts.n != arm.n:
+        return None
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, facts.n))
+    theirs, ours = (flange_in_first(one, q)[:, :3, 3] for one in (facts.arm, arm))
+    off = register_robustly(ours, theirs).in_base(ours) - theirs
+    return float(np.linalg.norm(off, axis=1).max())
+
+
 def _geometry(facts: ControllerFacts, model: Model) -> Iterator[Difference]:
-    if facts.arm is not None:
-        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, facts.n))
-        controller_points = flange_in_first(facts.arm, q)[:, :3, 3]
-        model_points = flange_in_first(model.arm, q)[:, :3, 3]
-        off = np.linalg.norm(
-            register_robustly(model_points, controller_points).in_base(model_points)
-            - controller_points,
-            axis=1,
-        )
-        apart, name = float(off.max()), facts.model or "the controller's arm"
+    if (apart := flange_apart(facts, model.arm)) is not None:
+        name = facts.model or "the controller's arm"
         if apart > OTHER_ARM:
             yield Difference(
                 ("robot",), f"an arm whose flange is up to {1e3 * apart:.0f} mm from the "

@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 from pydantic import Field
 
 from gapbridge.core.errors import InputError
+from gapbridge.core.files import is_file
 from gapbridge.drivers.section import Section
 
 
@@ -53,10 +54,13 @@ class ProfileSettings(DriverSettings):
         return Path(self.profile) if self.names_file else self.shipped / f"{self.profile}.yaml"
 
     def located(self, folder: Path) -> Self:
-        """Return the settings with absolute paths. Raises InputError for an unknown profile."""
+        """Return the settings with absolute paths. Raises InputError where there is no profile."""
         settings = super().located(folder)
         if self.names_file:
-            return settings.model_copy(update={"profile": str((folder / self.profile).resolve())})
+            path = (folder / self.profile).resolve()
+            if not is_file(path):
+                raise InputError(f"{path}: file not found, expected a profile", ("link", "profile"))
+            return settings.model_copy(update={"profile": str(path)})
         if not self.profile_path.is_file():
             shipped = ", ".join(sorted(path.stem for path in self.shipped.glob("*.yaml")))
             raise InputError(

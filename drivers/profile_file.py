@@ -36,7 +36,7 @@ def name_of(keys: Keys) -> str:
 
 Schema = TypeVar("Schema", bound=BaseModel)
 # a signal may be called ``on``
-PROFILE = Kind("profile", "a profile", "dbc: ...", ProfileError, loaders(on_is_text=True))
+PROFILE = Kind("profile", "a profile", "name: ...", ProfileError, loaders(on_is_text=True))
 
 
 def read_profile_file(path: Path, schema: type[Schema]) -> tuple[ProfileDocument, Schema]:
@@ -50,6 +50,4 @@ def read_profile_file(path: Path, schema: type[Schema]) -> tuple[ProfileDocument
         return document, schema.model_validate(document.data)
     except ValidationError as error:
         keys, text = validation_errors(schema, error)[0]
-        raise (
-            ProfileError(f"{path}: {text}") if keys is None else document.error(keys, text)
-        ) from None
+        raise document.error(keys, text) from None

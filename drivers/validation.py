@@ -44,10 +44,8 @@ _EXPECTED_TEXTS = {
 }
 
 
-def validation_errors(
-    schema: type[BaseModel], error: ValidationError
-) -> list[tuple[Keys | None, str]]:
-    """Return the keys of each error (None: the key itself is invalid) and its text.
+def validation_errors(schema: type[BaseModel], error: ValidationError) -> list[tuple[Keys, str]]:
+    """Return the keys of each error and its text.
 
     Unknown keys come first: a misspelt key is also a missing one.
     """
@@ -62,14 +60,16 @@ def _is_echo(detail: ErrorDetails) -> bool:
     return bool(detail["ctx"]["actual_length"] != len(detail["input"]))
 
 
-def _validation_error(schema: type[BaseModel], detail: ErrorDetails) -> tuple[Keys | None, str]:
+def _validation_error(schema: type[BaseModel], detail: ErrorDetails) -> tuple[Keys, str]:
     if detail["type"] == "invalid_key":
-        return None, f"found a key {detail['input']!r}, expected a word"
-    keys, model = _file_keys(schema, detail["loc"])
+        keys, _ = _file_keys(schema, detail["loc"][:-1], False)
+        return [*keys, str(detail["input"])], f"found a key {detail['input']!r}, expected a word"
+    unknown = detail["type"] == "extra_forbidden"
+    keys, model = _file_keys(schema, detail["loc"], unknown)
     if detail["type"] == "union_tag_invalid":
         keys.append(_discriminator_key(str(detail["ctx"].get("discriminator", ""))))
         found, expected = repr(detail["ctx"]["tag"]), f"one of {detail['ctx']['expected_tags']}"
-    elif detail["type"] == "extra_forbidden":
+    elif unknown:
         found, expected = _unknown_key(keys, model)
     else:
         found, expected = _found_text(detail), _expected_text(detail, _description(schema, keys))
@@ -111,11 +111,12 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _file_keys(
-    schema: type[BaseModel], loc: tuple[str | int, ...]
+    schema: type[BaseModel], loc: tuple[str | int, ...], unknown: bool
 ) -> tuple[list[str | int], type[BaseModel] | None]:
     """Return the keys of the file in pydantic's location, and the model of the last one.
 
-    Pydantic puts the names of union members and validators between the keys.
+    Pydantic puts the names of union members and validators between the keys. ``unknown``: the last
+    one is a key that no model has.
     """
     keys: list[str | int] = []
     models, holder = [schema], None
@@ -125,23 +126,24 @@ def _file_keys(
             keys.append(str(part) if names_entry else part)
             names_entry = False
             continue
+        if len(models) > 1 and (chosen := [m for m in models if _tag(m) == part]):
+            models = chosen  # before keys: a kind of instrument is called ``file`` as its key is
+            continue
         owner = next((m for m in models if part in m.model_fields), None)
         if owner is not None:
             holder = owner
             keys.append(part)
             models = _models(owner.model_fields[part].annotation)
             names_entry = typing.get_origin(owner.model_fields[part].annotation) is dict
-        elif chosen := [m for m in models if _tag(m) == part]:
-            models = chosen
-        elif part == loc[-1] and models and not _is_union_label(part, models):
+        elif part == loc[-1] and models and (unknown or not _is_union_label(part, models)):
             chosen = [m for m in models if m.__name__ in loc] or models
             return [*keys, part], chosen[0]
     return keys, holder
 
 
 def _tag(model: type[BaseModel]) -> str | None:
-    """Return the driver, or the mode, whose keys a model has; None: it is no member of a union."""
-    for name in ("driver", "mode"):
+    """Return the driver, mode or kind that a model is of; None: it is no member of a union."""
+    for name in ("driver", "mode", "kind"):
         field = model.model_fields.get(name)
         values = () if field is None else typing.get_args(field.annotation)
         if len(values) == 1:

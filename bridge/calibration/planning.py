@@ -81,21 +81,21 @@ def make_plan(cell: Cell, options: SessionOptions, emit: Callable[[str, float], 
     settings, instrument = cell.calibration, options.instrument
     workspace = workspace_of(cell, instrument.measures)
     observable = observable_of(cell, instrument, max(len(workspace.places), 1))
-    return plan(
-        identifiable_parameters(cell.model, effects_of(cell), observable=observable),
-        observable,
-        loads_of(cell),
-        workspace,
-        SessionDesign(
-            poses=options.poses or settings.poses,
-            held_out=settings.held_out,
-            repeats=settings.repeats,
-            seed=options.seed,
-            sigma=float(np.hypot(instrument.sigma or cell.metrology.sigma,
-                                 cell.metrology.repeatability or REPEATABILITY)),
-        ),
-        emit,
+    design = SessionDesign(
+        poses=options.poses or settings.poses,
+        held_out=settings.held_out,
+        repeats=settings.repeats,
+        seed=options.seed,
+        sigma=float(np.hypot(instrument.sigma or cell.metrology.sigma,
+                             cell.metrology.repeatability or REPEATABILITY)),
     )  # fmt: skip
+    parameters = identifiable_parameters(cell.model, effects_of(cell), observable=observable)
+    try:
+        return plan(parameters, observable, loads_of(cell), workspace, design, emit)
+    except PlanError as error:
+        if error.keys and options.poses:
+            raise PlanError(f"--poses: {error.message}") from None
+        raise cell.error(error.keys or ("calibration",), error.message) from None
 
 
 def workspace_of(cell: Cell, kind: str) -> Workspace:

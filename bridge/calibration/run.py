@@ -40,7 +40,7 @@ from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
-from gapbridge.core.errors import LinkError
+from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.clock import SYSTEM
 
 JOBS: dict[str, tuple[str, type[Job]]] = {
@@ -74,6 +74,10 @@ def run_session(cell: Cell, options: SessionOptions) -> None:
             prompt.say()
             prompt.say(f"interrupted; {_how_to_resume(cell, options, session)}")
             raise click.exceptions.Exit(128 + signal.SIGINT) from None
+        except InputError:
+            if not session.has_begun:
+                journal.discard()  # nothing to resume
+            raise
         except LinkError:
             prompt.say(_how_to_resume(cell, options, session))
             raise

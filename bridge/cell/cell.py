@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from gapbridge.bridge.cell.document import read_document
-from gapbridge.bridge.cell.effects import compliance_terms, term_from_entry
+from gapbridge.bridge.cell.effects import compliance_terms, effect_terms
 from gapbridge.bridge.cell.message import error_lines, located, located_message, message_at
 from gapbridge.bridge.cell.plausibility import check_plausibility
 from gapbridge.bridge.cell.robot import build_arm
@@ -29,7 +29,7 @@ from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.effects import Term
 from gapbridge.core.errors import ArmError, CellError, EquilibriumError, InputError, Keys
 from gapbridge.core.files import Document
-from gapbridge.core.load_bounds import PAYLOAD_FACTOR
+from gapbridge.core.load_bounds import LEAST, PAYLOAD_FACTOR
 from gapbridge.core.loads import Loads
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Uncertain
@@ -148,6 +148,17 @@ class Cell:
         return {} if origin is None else dict(origin.intervals)
 
     @property
+    def payload_problem(self) -> InputError | None:
+        """Return the error of effects that leave less than no load on the flange; None: none."""
+        mass, added = self.model.payload_mass, self.model.added_mass
+        if mass + added >= LEAST:
+            return None
+        return self.error(
+            ("payload", "mass"),
+            f"found {mass:g} kg and {added:g} kg of the effects, expected 0 kg or more together",
+        )
+
+    @property
     def simulation(self) -> Simulation:
         """Return section ``simulation``."""
         return self.file.simulation
@@ -203,9 +214,7 @@ def build_cell(file: CellFile, document: Document) -> Cell:
         warnings = _check_payload(file, arm)
         if file.robot.tip is not None and file.robot.urdf is None:
             warnings.append((("robot", "tip"), "has no effect without robot.urdf"))
-        terms = compliance_terms(file.compliance, arm) + tuple(
-            term_from_entry(e, arm, ("effects", i)) for i, e in enumerate(file.effects)
-        )
+        terms = compliance_terms(file.compliance, arm) + effect_terms(file.effects, arm)
     except (ArmError, CellError) as error:
         raise located(document, error) from None
     tcp = file.tool.tcp

@@ -23,6 +23,24 @@ from gapbridge.drivers.validation import suggestion
 VALUE = "value"  # key in the file of a parameter without a name
 
 
+def effect_terms(entries: Sequence[EffectEntry], arm: Arm) -> tuple[Term, ...]:
+    """Return the terms of section ``effects``. Raises CellError.
+
+    Effects at one joint add up, as a second ``--apply`` adds them; equal entries are a copy.
+    """
+    terms: list[Term] = []
+    for i, entry in enumerate(entries):
+        term = term_from_entry(entry, arm, ("effects", i))
+        if term in terms:
+            raise CellError(
+                f"found the same {entry.effect} as in entry {terms.index(term) + 1}, expected it "
+                "once",
+                ("effects", i),
+            )
+        terms.append(term)
+    return tuple(terms)
+
+
 def term_from_entry(entry: EffectEntry, arm: Arm, keys: Keys) -> Term:
     """Return the term of the entry of ``effects`` at ``keys``. Raises CellError."""
     try:

@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
+
 from gapbridge.bridge.cell.cell import Cell
-from gapbridge.bridge.cell.plausibility import Findings
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InvalidStateError, StaleStateError
+from gapbridge.core.rotation import roll_pitch_yaw
 from gapbridge.core.state import RobotState
 from gapbridge.drivers import make_driver
 from gapbridge.drivers.clock import Clock
+from gapbridge.drivers.controller_facts import ControllerFacts, flange_apart
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.rate_check import RateCheck
 from gapbridge.drivers.ur_rtde.enquiry import require_listening
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 RATE_SAMPLES, READ_TIMEOUT = 50, 2.0  # number of states, s
 RATE_KEY = ("link", "rate")
+NOT_REPORTED = "not reported"
 MIN_RATE_SHARE = 0.8  # measured state rate / configured rate
 
 
-def live_findings(cell: Cell, clock: Clock) -> Findings:
-    """Return the differences of a cell from its controller; reads only, never moves the arm.
+class Comparison(NamedTuple):
+    """A cell beside its controller."""
 
-    Raises CellError for a cell without a link, LinkError if the controller cannot be read.
+    errors: list[str]  # lines that name file, line, key, what was found and what was expected
+    warnings: list[str]
+    table: list[str]  # lines: quantity, cell, controller
+
+
+def compare_live(cell: Cell, clock: Clock) -> Comparison:
+    """Return a cell beside its controller; reads only, never moves the arm.
+
+    An error is what arming would refuse. Raises CellError for a cell without a link, LinkError if
+    the controller cannot be read.
     """
     link = cell.link
     if link is None:
@@ -30,22 +47,59 @@ def live_findings(cell: Cell, clock: Clock) -> Findings:
     driver = make_driver(link, cell.model, clock=clock)
     errors: list[str] = []
     warnings: list[str] = []
+    check = RateCheck(driver.rate)
     with driver:
         state = read_valid_state(driver)
-        differences = list(driver.differences(state))
-        for difference in differences:
-            text = f"{cell.path}, line {cell.document.line(difference.keys)}: {difference}"
-            (errors if difference.sure else warnings).append(text)
-        if driver.mismatch() is not None and not errors:
-            errors.append(f"{cell.path}: {driver.mismatch()}")
-        rate = _measured_rate(driver)
-    if rate < MIN_RATE_SHARE * link.rate and not any(d.keys == RATE_KEY for d in differences):
+        facts, differences = driver.facts(state), driver.differences(state)
+        mismatch = driver.mismatch()
+        rate = _measured_rate(driver, check)
+    if check.problem:
+        differences = [d for d in differences if d.keys != RATE_KEY]
+        errors.append(f"{cell.path}, line {cell.document.line(RATE_KEY)}: {check.problem}")
+    for difference in differences:
+        text = f"{cell.path}, line {cell.document.line(difference.keys)}: {difference}"
+        (errors if difference.sure else warnings).append(text)
+    if mismatch is not None and not errors:
+        errors.append(f"{cell.path}: {mismatch}")
+    known = check.problem or any(d.keys == RATE_KEY for d in differences)
+    if rate < MIN_RATE_SHARE * link.rate and not known:
         line = cell.document.line(RATE_KEY)
         warnings.append(
             f"{cell.path}, line {line}: link.rate: found {link.rate:g} Hz, expected about "
             f"{rate:.0f} Hz, the measured rate"
         )
-    return Findings(errors, warnings)
+    return Comparison(errors, warnings, _table(cell, facts, rate))
+
+
+def _table(cell: Cell, facts: ControllerFacts, rate: float) -> list[str]:
+    """Return the lines of what a cell says and its controller reports; ``rate`` is measured, Hz."""
+    model, tcp, apart = cell.model, facts.tcp, flange_apart(facts, cell.arm)
+    ours = model.tool_in_flange
+    reported = NOT_REPORTED if facts.rate is None else f"{facts.rate:g} Hz"
+    rows = [
+        ("quantity", "cell", "controller"),
+        ("joints", str(cell.arm.n), str(facts.n)),
+        ("TCP xyz", _text(ours[:3, 3], "m"), _text(None if tcp is None else tcp[:3, 3], "m")),
+        ("TCP rpy", _text(roll_pitch_yaw(ours[:3, :3]), "rad"),
+         _text(None if tcp is None else roll_pitch_yaw(tcp[:3, :3]), "rad")),
+        ("payload", _text(model.payload_mass, "kg"), _text(facts.payload, "kg")),
+        ("payload cog", _text(model.payload_cog, "m"), _text(facts.payload_cog, "m")),
+        ("gravity", _text(model.gravity, "m/s2"), _text(facts.gravity, "m/s2")),
+        ("calibration", "none" if cell.file.robot.calibration is None else "robot.calibration",
+         NOT_REPORTED if apart is None else f"flange within {1e3 * apart:.2f} mm of the cell's"),
+        ("rate", f"{cell.file.link.rate:g} Hz" if cell.file.link else "",
+         f"{reported}, measured {rate:.0f} Hz"),
+    ]  # fmt: skip
+    widths = [max(len(row[i]) for row in rows) for i in (0, 1)]
+    return [f"{a:{widths[0]}}  {b:{widths[1]}}  {c}" for a, b, c in rows]
+
+
+def _text(value: Array | float | None, unit: str) -> str:
+    """Return a number or a vector with its unit, as the table shows it."""
+    if value is None:
+        return NOT_REPORTED
+    numbers = [f"{round(float(v), 6) + 0.0:g}" for v in np.atleast_1d(value)]
+    return f"{numbers[0] if np.ndim(value) == 0 else '[' + ', '.join(numbers) + ']'} {unit}"
 
 
 def read_valid_state(driver: Driver) -> RobotState:
@@ -63,12 +117,13 @@ def read_valid_state(driver: Driver) -> RobotState:
                 raise
 
 
-def _measured_rate(driver: Driver) -> float:
-    """Return the measured rate of states, Hz."""
+def _measured_rate(driver: Driver, check: RateCheck) -> float:
+    """Return the rate of states by the controller's clock, Hz; ``check`` gets their timestamps."""
     now = driver.clock.monotonic
     start = now()
-    count = 0
-    while count < RATE_SAMPLES and now() - start < READ_TIMEOUT:
-        read_valid_state(driver)
-        count += 1
-    return count / max(now() - start, 1e-6)
+    times = [read_valid_state(driver).timestamp]
+    while len(times) <= RATE_SAMPLES and now() - start < READ_TIMEOUT:
+        times.append(read_valid_state(driver).timestamp)
+    for time in times:
+        check.take(time)
+    return (len(times) - 1) / max(times[-1] - times[0], 1e-6)

@@ -30,16 +30,14 @@ def message_at(document: Document, keys: Keys, text: str) -> str:
 def error_lines(document: Document, schema: type[BaseModel], error: ValidationError) -> list[str]:
     """Return a line per error: file, line, key path, what was found, what was expected."""
     return [
-        f"{document.path}{'' if keys is None else f', line {document.line(keys)}'}: {text}"
+        f"{document.path}, line {document.line(keys)}: {text}"
         for keys, text in validation_errors(schema, error)
     ]
 
 
-def validation_errors(
-    schema: type[BaseModel], error: ValidationError
-) -> list[tuple[Keys | None, str]]:
-    """Return the keys of each error (None: the key itself is invalid) and its text with them."""
+def validation_errors(schema: type[BaseModel], error: ValidationError) -> list[tuple[Keys, str]]:
+    """Return the keys of each error and its text with them."""
     return [
-        (keys, text if keys is None else f"{key_path(keys)}: {text}")
+        (keys, f"{key_path(keys)}: {text}")
         for keys, text in validation.validation_errors(schema, error)
     ]

@@ -13,7 +13,7 @@ from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
 from gapbridge.core.errors import LogError, LogOptionError
-from gapbridge.core.load_bounds import PAYLOAD_FACTOR, WRENCH
+from gapbridge.core.load_bounds import LEAST, PAYLOAD_FACTOR, WRENCH
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.sources import SourceOptions, source_of
 from gapbridge.core.notes import Note
@@ -72,7 +72,10 @@ def joint_names(cell: Cell) -> tuple[str, ...]:
 
 
 def check_log(log: Log, cell: Cell) -> None:
-    """Raise LogError if joint angles, units or loads of a log are impossible for the arm."""
+    """Raise LogError if joint angles, units or loads of a log are impossible for the arm.
+
+    Raises CellError where the cell's own payload, of a log that declares none, is.
+    """
     log.check_size()
     for name in ("actual_q", "target_q"):
         if np.isinf(log.columns.get(name, np.zeros(0))).any():
@@ -85,4 +88,14 @@ def check_log(log: Log, cell: Cell) -> None:
         raise LogError(
             f"{log.path}: row {log.line(row)}, column payload: found {mass[row]:g} kg, out of "
             f"range: expected 0 to {rated:g} kg, what {cell.arm.name} is rated for"
+        )
+    added = cell.model.added_mass
+    if mass is None:
+        if (problem := cell.payload_problem) is not None:
+            raise problem
+    elif (below := (mass >= 0.0) & (mass + added < LEAST)).any():
+        row = int(np.argmax(below))
+        raise LogError(
+            f"{log.path}: row {log.line(row)}, column payload: found {mass[row]:g} kg and "
+            f"{added:g} kg of the effects of {cell.path}, expected 0 kg or more together"
         )

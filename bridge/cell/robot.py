@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gapbridge.bridge.cell.schema import Calibration, Robot
 from gapbridge.core.arm import Arm, arm_from_dh, builtin_arm
-from gapbridge.core.errors import ArmError, CellError
+from gapbridge.core.errors import ArmError, CellError, first_line
 from gapbridge.core.files import is_file, quoted, read_text
 from gapbridge.core.urdf import arm_from_urdf
 
@@ -95,9 +95,15 @@ def read_calibration(path: Path) -> dict[str, list[float]]:
         raise ArmError(
             f"file not found: {path}, expected a calibration.conf", CALIBRATION
         ) from None
-    except (OSError, UnicodeDecodeError, configparser.Error) as error:
-        what = " ".join(str(error).split())
-        raise ArmError(f"{path} cannot be read: {what}", CALIBRATION) from None
+    except OSError as error:
+        raise ArmError(
+            f"{path} cannot be read ({first_line(error)}), expected a calibration.conf", CALIBRATION
+        ) from None
+    except (UnicodeDecodeError, configparser.Error):
+        raise ArmError(
+            f"{path}: found no sections of keys and values, expected a calibration.conf",
+            CALIBRATION,
+        ) from None
     deltas: dict[str, list[float]] = {}
     for section in parser.sections():
         for key in DELTAS:

@@ -92,7 +92,9 @@ class EffectEntry(Section):
 
     effect: str = Field(description="an effect of the catalogue")
     joint: int | None = Field(default=None, strict=True, description="from 1")
-    order: Number | None = Field(default=None, description="cycles per turn of the joint")
+    order: Number | None = Field(
+        default=None, gt=0.0, le=1.0e5, description="cycles per turn of the joint"
+    )
     parameters: dict[str, Number] = Field(default={}, description="name: value")
     stand_in: bool = Field(default=False, strict=True, description="effective, not proved")
 

@@ -13,10 +13,11 @@ from typing import Any
 
 import click
 
-from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
 from gapbridge.bridge.daemon.daemon import Daemon, Say
 from gapbridge.bridge.daemon.output import Output
+from gapbridge.bridge.daemon.runnable import require_runnable
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.events import Event
 from gapbridge.drivers.clock import SYSTEM
@@ -36,7 +37,9 @@ def run_cell(
     Prints what happens and a summary; returns the exit code. Raises InputError for a cell that
     cannot be run, LinkError where the robot cannot be reached. ``log`` gets every event.
     """
-    configuration = read_configuration(cell.path if isinstance(cell, Cell) else cell)
+    cell = cell if isinstance(cell, Cell) else load_cell(cell)
+    configuration = read_configuration(cell.path)
+    require_runnable(cell, configuration.settings, SYSTEM)
     output = Output(click.echo, SYSTEM)
     echo = output.behind(click.echo)
     try:

@@ -30,6 +30,10 @@ def ask(cell: Path, command: str) -> Any:
             refused = f"{folder / name}: found a daemon of another user, expected your own"
         except OSError:
             continue
+    if not refused:
+        from gapbridge.bridge.cell.document import read_document  # brings yaml
+
+        read_document(cell)  # raises for what is no cell
     raise InputError(refused or f"{cell}: found no running daemon, expected one: gapbridge run")
 
 

@@ -17,6 +17,7 @@ from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.arrays import Array
 from gapbridge.core.state import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, RobotState
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.rate_check import RateCheck
 from gapbridge.drivers.robot_modes import PLAYING, why_not_ready
 
 MIN_SPEED_SCALING = 0.95  # below it, an arm that we move lags behind its setpoints
@@ -30,9 +31,6 @@ OVERRUN_SPAN = 1.0  # s over which missed cycles are counted
 MAX_MISSED_SHARE = 0.05  # share of a span's cycles that may be missed
 SATURATION_TIMEOUT = 1.0  # s that an offset may be at its limits
 _AT_LIMIT = 1 << ENVELOPE | 1 << JOINT_OFFSET | 1 << JOINT_LIMIT
-GAPS = 5  # between states, before the controller's rate counts as known
-GAPS_KEPT = 50  # gaps between states that are remembered
-RATE_TOLERANCE = 1.5  # cycles of the cell: bound of the shortest gap between states
 # bits of a cycle's flags
 DEGRADED, LATE, RESYNC, RAMPING_OUT, UNSOLVED, NOTHING, TOOK_BACK = 1, 2, 4, 8, 16, 32, 64
 
@@ -123,40 +121,6 @@ class SaturationWatch:
         if now - self._since <= SATURATION_TIMEOUT:
             return None
         return f"the offset has been clamped at its limits for {now - self._since:.2f} s"
-
-
-class RateCheck:
-    """Compares the cell's rate with the controller's update rate."""
-
-    def __init__(self, rate: float) -> None:
-        self._rate = rate
-        self._last: float | None = None  # s, controller clock
-        self._gaps: deque[float] = deque(maxlen=GAPS_KEPT)
-
-    def take(self, timestamp: float) -> None:
-        """Add a state's timestamp, s, controller clock."""
-        if self._last is not None and timestamp > self._last:
-            self._gaps.append(timestamp - self._last)
-        self._last = timestamp
-
-    @property
-    def known(self) -> bool:
-        """Return whether there are enough states for the check."""
-        return len(self._gaps) >= GAPS
-
-    @property
-    def problem(self) -> str:
-        """Return a message if the cell's rate is above the controller's; empty: it is not.
-
-        The shortest gap is the controller's period: delays only lengthen gaps.
-        """
-        shortest = min(self._gaps, default=0.0)
-        if shortest <= RATE_TOLERANCE / self._rate:
-            return ""
-        return (
-            f"link.rate: found {self._rate:g} Hz, expected at most {1.0 / shortest:.4g} Hz: the "
-            f"controller has a new state every {1e3 * shortest:.3g} ms"
-        )
 
 
 class LoopChecks:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import roll_pitch_yaw, rpy_matrix, transform
+from gapbridge.core.urdf import checked_urdf
 
 REVOLUTE = ("revolute", "continuous")
 INSTEAD = {
@@ -69,13 +69,9 @@ class _Document:
     def __init__(self, path: Path) -> None:
         try:
             self.text = path.read_text(encoding="utf-8")
-            self.root = ElementTree.fromstring(self.text)
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{path}: cannot be read ({error})") from None
-        except ElementTree.ParseError as error:
-            raise InputError(f"{path}: found broken XML ({error}), expected a URDF") from None
-        if self.root.tag != "robot":
-            raise InputError(f"{path}: found <{self.root.tag}>, expected a URDF's <robot>")
+        self.root = checked_urdf(path, self.text)
         self.joints = {str(j.get("name")): j for j in self.root.findall("joint")}
         self.links = {str(link.get("name")): link for link in self.root.findall("link")}
 

@@ -89,11 +89,12 @@ class _Stage:
         self.path, self.layer = path, Sdf.Layer.CreateAnonymous(".usda")
         self.layer.subLayerPaths.append(str(path.resolve()))
         try:
+            source = Usd.Stage.Open(
+                str(path)
+            )  # first: where it is a sublayer, USD prints a warning
             self.stage: Any = Usd.Stage.Open(self.layer)
-            source = Usd.Stage.Open(str(path))
-        except Tf.ErrorException as error:
-            text = " ".join(str(error).split())
-            raise InputError(f"{path}: found no USD that opens ({text})") from None
+        except Tf.ErrorException:
+            raise InputError(f"{path}: found no USD that opens, expected a stage") from None
         self.default = source.GetDefaultPrim()
         self.folder = folder or path.parent
         self.unit = UsdGeom.GetStageMetersPerUnit(source)

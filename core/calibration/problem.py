@@ -51,10 +51,9 @@ def bounds_of(parameters: Parameters, readings: Readings) -> Bounds:
     declared = readings.loads.payload_mass
     nominal = parameters.nominal
     lightest = nominal.payload_mass if declared is None else float(np.min(declared))
-    modelled = sum(t.values[0] for t in nominal.terms if CATALOGUE[t.effect].adds_mass)
     for i, (t, _) in enumerate(parameters.place):
         if CATALOGUE[parameters.terms[t].effect].adds_mass:
-            lower[i] = max(lower[i], -max(lightest + modelled, 0.0))
+            lower[i] = max(lower[i], -max(lightest + nominal.added_mass, 0.0))
     return Bounds(lower, parameters.upper, prior_std, parameters.begin)
 
 

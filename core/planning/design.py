@@ -170,9 +170,10 @@ def _require(unknown: int, observable: Observable, design: SessionDesign) -> Non
     needed = unknown // observable.equations + 1
     if design.poses < needed:
         raise PlanError(
-            f"too few poses: found {design.poses}, expected at least {needed}: {unknown} unknowns, "
+            f"found {design.poses}, expected at least {needed}: {unknown} unknowns, "
             f"{observable.equations} number(s) a {observable.kind} reading; plan more poses or "
-            "ask for fewer effects"
+            "ask for fewer effects",
+            ("calibration", "poses"),
         )
 
 

@@ -33,6 +33,7 @@ class Journal:
         self.entries: list[Entry] = []
         self.torn = False  # the last line was incomplete and has been removed
         self._fd = -1
+        self._made_folder = False
 
     def open(self) -> None:
         """Lock the journal and read its entries.
@@ -41,6 +42,7 @@ class Journal:
         damaged.
         """
         try:
+            self._made_folder = not self.path.parent.exists()
             make_folder(self.path.parent)
             self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, MODE)
             sync_folder(self.path.parent)
@@ -82,6 +84,13 @@ class Journal:
                 os.ftruncate(self._fd, end)
             raise RunError(f"{self.path}: cannot be written: {error.strerror}") from None
         return entry
+
+    def discard(self) -> None:
+        """Remove the file, and its folder if ``open`` made it and nothing else is in it."""
+        with contextlib.suppress(OSError):
+            self.path.unlink()
+            if self._made_folder:
+                self.path.parent.rmdir()
 
     def close(self) -> None:
         """Close and unlock the file. May be repeated."""

@@ -10,19 +10,16 @@ import numpy as np
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.cell import cell_errors
-from gapbridge.bridge.cell.live import live_findings
+from gapbridge.bridge.cell.live import compare_live
 from gapbridge.bridge.cell.log_consistency import log_findings
 from gapbridge.bridge.cell.message import located_message, message_at
 from gapbridge.bridge.cell.plausibility import Findings
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cell.verification_mark import read_mark
 from gapbridge.bridge.cli.options import FILE, cell_argument
-from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.core.calibration.spread import parameters_named
 from gapbridge.core.errors import InputError
-from gapbridge.drivers import make_driver
 from gapbridge.drivers.clock import SYSTEM
-from gapbridge.drivers.link_settings import ProfileSettings
 
 
 @click.command()
@@ -40,11 +37,11 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
     """Check a cell file for mistakes, and report each with its line.
 
     Checks units by plausible magnitude (m, rad, kg, °C), reach, masses and limits; an impossible
-    value is an error, an unusual one a warning. With --live also compares TCP, payload, gravity,
-    geometry and rate with the controller. With --log also compares the arm with measured poses; if
-    they do not agree, common mistakes are tried (modified DH rows, a sign, inches, the order of
-    joints, frames), and the one that explains them is reported. Exits with 0 if there is no error,
-    2 otherwise.
+    value is an error, an unusual one a warning. With --live also shows TCP, payload, gravity,
+    geometry and rate beside the controller's, and compares them; what arming would refuse is an
+    error. With --log also compares the arm with measured poses; if they do not agree, common
+    mistakes are tried (modified DH rows, a sign, inches, the order of joints, frames), and the one
+    that explains them is reported. Exits with 0 if there is no error, 2 otherwise.
 
     Example: gapbridge check cell.yaml --live
     """
@@ -57,9 +54,11 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
             errors += findings.errors
             warnings += findings.warnings
         if live and not errors:
-            findings = live_findings(opened, SYSTEM)
-            errors += findings.errors
-            warnings += findings.warnings
+            compared = compare_live(opened, SYSTEM)
+            errors += compared.errors
+            warnings += compared.warnings
+            for line in compared.table:
+                click.echo(line)
         for log in logs if not errors else ():
             findings = log_findings(opened, log)
             errors += findings.errors
@@ -71,13 +70,15 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
     if errors:
         raise click.exceptions.Exit(2)
     count = f", {len(warnings)} warning{'s' * (len(warnings) != 1)}" if warnings else ""
-    compared = [*["its controller"] * live, *map(str, logs)]
-    text = f" with {' and '.join(compared)}" if compared else ""
+    beside = [*["its controller"] * live, *map(str, logs)]
+    text = f" with {' and '.join(beside)}" if beside else ""
     click.echo(f"{cell}: fit to be used{text}{count}")
 
 
 def _further_findings(cell: Cell) -> Iterator[Findings]:
-    """Yield what only predict, calibrate or run would refuse: names, places, files."""
+    """Yield what only predict, calibrate or run would refuse: loads, names, places, files."""
+    if (problem := cell.payload_problem) is not None:
+        yield Findings([str(problem)], [])
     try:
         if cell.spread.names:
             parameters_named(cell.model, cell.spread.names, "provenance")
@@ -101,20 +102,14 @@ def _run_findings(cell: Cell) -> Findings:
         text = f"joint {i + 1}: found limits {limits.lower[i]:g} to {limits.upper[i]:g} rad"
         line = message_at(cell.document, ("robot",), f"{text}, expected lower below upper")
         return Findings([line], [])
+    from gapbridge.bridge.daemon.runnable import require_runnable
+
     try:
         settings = read_configuration(cell.path).settings
-        if isinstance(settings.link, ProfileSettings):
-            make_driver(
-                settings.link, cell.model, clock=SYSTEM
-            )  # checks the profile against the arm
+        require_runnable(cell, settings, SYSTEM)
     except InputError as error:
         return Findings([located_message(cell.document, error)], [])
     setpoints, rate = settings.setpoints, settings.link.rate
-    try:
-        make_source(setpoints, cell.arm.n, True, cell.path.parent, SYSTEM, rate)
-    except InputError as error:
-        keys = error.keys or ("setpoints", "file")
-        return Findings([message_at(cell.document, keys, error.message)], [])
     if setpoints.source != "trajectory":
         return Findings([], [])
     from gapbridge.bridge.cli.cell.trajectory_check import trajectory_findings

@@ -25,6 +25,8 @@ from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.verification_mark import read_mark
 
+GAUGE = "{kind: dial_gauge, unit: mm}\n  instrument_at: [1, 0, 1]"
+
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CommandResult]:
@@ -211,6 +213,8 @@ def test_end_of_input_and_quit_show_how_to_resume(tmp_path: Path) -> None:
         ([], {"instrument": "{kind: sphere}"}, "calibration.instrument_at: found nothing"),
         ([], {"instrument": "{kind: file, unit: mm, file: none/x.csv}"}, "no such file"),
         (["--apply", "none/new.yaml"], {}, "found no folder none"),
+        ([], {"instrument": GAUGE, "poses": 6}, "calibration.poses: found 6, expected at least"),
+        (["--poses", "7"], {"instrument": GAUGE}, "--poses: found 7, expected at least"),
     ],
 )
 def test_unusable_input_is_refused_in_one_line(
@@ -222,6 +226,7 @@ def test_unusable_input_is_refused_in_one_line(
     assert phrase in result.err
     assert result.err.count("\n") == 1
     assert "Traceback" not in result.err
+    assert not (tmp_path / "s").exists()  # nothing to resume
 
 
 def test_what_a_planned_session_ignores_is_told(clean: tuple[Path, CommandResult]) -> None:

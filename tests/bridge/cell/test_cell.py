@@ -176,6 +176,18 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
             "order: found 2", "none for backlash",
         ),
         (ARM + "effects: [{effect: transmission_error, joint: 2}]", "found none", "per turn"),
+        (
+            ARM + "effects: [{effect: transmission_error, joint: 2, order: -3}]",
+            "effects entry 1.order: found -3", "more than 0",
+        ),
+        (
+            ARM + "effects: [{effect: transmission_error, joint: 2, order: 1e9}]",
+            "effects entry 1.order: found 1000000000.0", "100000 or less",
+        ),
+        (
+            ARM + "effects:\n" + 2 * "- {effect: backlash, joint: 1, parameters: {value: 1e-3}}\n",
+            "line 4: effects entry 2: found the same backlash as in entry 1", "it once",
+        ),
         (ARM + "metrology: {registered: 1}", "found 1", "true or false"),
         (ARM + "metrology: {sigma: -1}", "found -1", "0 or more"),
         (ARM + "link: {host: '10.0.0.2:30004'}", "'10.0.0.2:30004'", "without a port"),
@@ -188,7 +200,21 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
         (ARM + "limits: {offset: 3}", "limits.offset: found 3", "0.1 or less"),
         ("robot: {model: ur10e, calibration: {delta_a: [1]}}", "1 values", "6"),
         ("robot: {model: ur10e, calibration: c.conf}", "file not found", "calibration.conf"),
-        ("5: 6\nrobot: {model: ur10e}", "a key 5", "a word"),
+        ("5: 6\nrobot: {model: ur10e}", "line 1: 5: found a key 5", "a word"),
+        (ARM + "payload: {mass: 5, 6: 7}", "line 2: payload.6: found a key 6", "a word"),
+        (ARM + "link: {driver: ur_rtde, 6: 7}", "line 2: link.6: found a key 6", "a word"),
+        (
+            ARM + "calibration: {instrument: {kind: file, file: r.csv}}",
+            "calibration.instrument.unit: found nothing", "of lengths",
+        ),
+        (
+            ARM + "calibration: {instrument: {kind: file, path: r.csv, unit: mm}}",
+            "unknown key 'path' in calibration.instrument", "known here",
+        ),
+        (
+            ARM + "calibration: {instrument: {kind: line_feed, unit: mm, port: 5000, tiemout: 3}}",
+            "unknown key 'tiemout' in calibration.instrument", "did you mean 'timeout'?",
+        ),
         (ARM + "payload: {mass: 010}", "line 2: payload.mass: found '010'", "leading zeros"),
         (ARM + "recording: {every: 1:30}", "line 2: recording.every: found '1:30'", "or colons"),
         (ARM + "recording: {folder: 5}", "recording.folder: found 5", "expected a path"),
@@ -280,6 +306,10 @@ def test_a_whole_number_may_be_a_float_and_a_float_whole(tmp_path: Path) -> None
         ("just words", "no keys"),
         ("robot: !!python/object:os.system []", "line 1"),
         ("robot: &a [*a]", "robot"),
+        (ARM + "payload: {mass: 5,5}", "line 2: mass: found a decimal comma (5,5), expected a"),
+        (ARM + "limits: {offset: 0,05}", "line 2: offset: found a decimal comma (0,05)"),
+        (ARM + f"payload: {{mass: {'9' * 5000}}}", "line 2: found '9999"),
+        (f"robot: {'[' * 3000}", "found values nested too deep, expected a few levels"),
         (ARM + 'setpoints: {file: "a\\0b"}', "line 2: found 'a\\x00b', expected no \\0 in it"),
     ],
 )
@@ -355,7 +385,7 @@ def test_a_factory_calibration_moves_the_arm_as_its_deltas_say(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("text", "phrase"),
     [
-        ("no ini", "cannot be read"),
+        ("no ini", "c.conf: found no sections of keys and values, expected a calibration.conf"),
         ("[a]\nb = 1", "none of"),
         ("[a]\ndelta_a = x", "c.conf: delta_a: found 'x', expected a list of finite numbers"),
         ("[a]\ndelta_a = [0, NaN]", "c.conf: delta_a: found '[0, NaN]', expected a list of fin"),

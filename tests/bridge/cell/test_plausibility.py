@@ -129,6 +129,7 @@ def test_an_unusual_value_is_a_warning(tmp_path: Path, text: str, phrase: str) -
         ({"more": "<mimic joint='j1'/>"}, "line 6: joint 'j2': found <mimic>"),
         ({"mass": "7369"}, "found 7369 kg of link 1"),
         ({"mass": "4000"}, "m reach, expected kg (grams?)"),
+        ({"mass": '4"/><inertia ixx="1e9'}, "found 1e+09 kg m2, inertia of link 1, expected kg m2"),
     ],
 )
 def test_a_urdf_in_other_units_is_refused_with_its_line_too(
@@ -149,6 +150,9 @@ def test_a_sane_urdf_passes_and_one_without_a_mass_warns(tmp_path: Path) -> None
     assert load_cell(path).warnings == ()
     (tmp_path / "arm.urdf").write_text(URDF.format(**(given | {"mass": "0"})), encoding="utf-8")
     assert "no mass of link 1" in load_cell(path).warnings[0]
+    heavy = URDF.format(**(given | {"mass": '4"/><inertia ixx="99'}))
+    (tmp_path / "arm.urdf").write_text(heavy, encoding="utf-8")
+    assert "found 99 kg m2, inertia of link 1" in load_cell(path).warnings[0]
 
 
 def test_lengths_of_a_calibration_that_cancel_are_right_as_they_stand(tmp_path: Path) -> None:

@@ -70,6 +70,22 @@ def test_a_cell_whose_verification_failed_is_not_fit(tmp_path: Path) -> None:
     assert gapbridge("check", path).code == 0
 
 
+def test_effects_that_leave_less_than_no_load_are_named_with_key_and_row(tmp_path: Path) -> None:
+    path = cell_of(
+        tmp_path, "effects: [{effect: payload, parameters: {value: -3}}]\npayload: {mass: 2}"
+    )
+    found = "found 2 kg and -3 kg of the effects"
+    assert refused("check", path).startswith(f"error: {path}, line 3: payload.mass: {found}")
+    columns, log = ",".join(f"actual_q_{i}" for i in range(6)), tmp_path / "log.csv"
+    log.write_text(f"{columns}\n0,-1,1,0,0,0\n")
+    predict = ("predict", log, "--cell", path, "--out", tmp_path / "out.csv")
+    assert refused(*predict).startswith(f"error: {path}, line 3: payload.mass: {found}")
+    log.write_text(f"payload,{columns}\n3,0,-1,1,0,0,0\n2,0,-1,1,0,0,0\n")
+    assert f"{log}: row 3, column payload: {found}" in refused(*predict)
+    log.write_text(f"payload,{columns}\n3,0,-1,1,0,0,0\n")
+    assert gapbridge(*predict).code == 0
+
+
 def test_a_trajectory_that_cannot_be_run_is_named(tmp_path: Path) -> None:
     path = cell(tmp_path, "127.0.0.1", more="setpoints: {source: trajectory, file: way.csv}\n")
     err = refused("check", path)
@@ -227,6 +243,10 @@ def test_every_command_refuses_it_in_one_line(tmp_path: Path) -> None:
         ("link: {driver: can, profile: openarm}", "line 2: link.profile: found 7 joints in"),
         ("link: {host: 127.0.0.2}\nsetpoints: {source: trajectory}",
          "line 3: setpoints.file: found nothing"),
+        ("link: {driver: replay, file: cell.yaml}",
+         "line 2: link.file: {folder}/cell.yaml: found no MCAP file"),
+        ("link: {driver: modbus, profile: none.yaml}",
+         "line 2: link.profile: {folder}/none.yaml: file not found, expected a profile"),
         ("calibration: {joint_range: {lower: [0], upper: [1]}}",
          "line 2: calibration.joint_range.lower: found 1 values, expected 6"),
         ("calibration: {joint_range: {lower: [0, 2, 0, 0, 0, 0], upper: [1, 1, 1, 1, 1, 1]}}",
@@ -246,7 +266,25 @@ def test_what_only_a_run_would_refuse_is_named_with_its_line(
     tmp_path: Path, lines: str, message: str
 ) -> None:
     path = cell_of(tmp_path, lines)
-    assert f"error: {path}, {message}" in refused("check", path)
+    assert f"error: {path}, {message.replace('{folder}', str(tmp_path))}" in refused("check", path)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        "link: {driver: replay, file: cell.yaml}",
+        "link: {host: 127.0.0.2}\nsetpoints: {source: trajectory, file: cell.yaml}",
+    ],
+)
+def test_a_run_that_cannot_begin_leaves_no_recording(tmp_path: Path, lines: str) -> None:
+    path = cell_of(tmp_path, lines + "\nrecording: {folder: recordings}")
+    assert f": {tmp_path}/cell.yaml: " in refused("run", path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_no_cell_cannot_be_armed(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("timestamp\n0\n")
+    assert "log.csv, line 1: found no keys, expected a cell" in refused("arm", tmp_path / "log.csv")
 
 
 @pytest.mark.parametrize(
@@ -362,13 +400,36 @@ def test_live_reports_where_the_controller_differs(host: str, tmp_path: Path) ->
     assert "line 1: robot.calibration: found geometry up to" in answer.err
 
 
-def test_a_rate_that_the_controller_has_not_is_one_warning(host: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("rate", "code", "text"),
+    [
+        (700, 0, "warning: {0}, line 4: link.rate: found 700 Hz, expected at most 500 Hz"),
+        (900, 2, "error: {0}, line 4: link.rate: found 900 Hz, expected at most 500 Hz: the contr"),
+    ],
+)
+def test_a_rate_that_the_controller_has_not_is_refused_as_arming_does(
+    host: str, tmp_path: Path, rate: int, code: int, text: str
+) -> None:
     path = cell(tmp_path, host)
-    path.write_text(path.read_text().replace(f"host: {host}", f"host: {host}, rate: 1000"))
-    warned = [line for line in gapbridge("check", path, "--live").err.splitlines()
-              if "link.rate" in line]  # fmt: skip
-    assert len(warned) == 1
-    assert "expected at most 500 Hz" in warned[0]
+    path.write_text(path.read_text().replace(f"host: {host}", f"host: {host}, rate: {rate}"))
+    answer = gapbridge("check", path, "--live")
+    (line,) = (line for line in answer.err.splitlines() if "link.rate" in line)
+    assert (answer.code, line.startswith(text.format(path))) == (code, True), line
+
+
+def test_live_shows_the_values_of_both_side_by_side(host: str, tmp_path: Path) -> None:
+    path = cell(tmp_path, host, "0.25")
+    path.write_text(path.read_text().replace("mass: 5", "mass: 2"))
+    shown = {line[:13].strip(): line[13:].split("  ") for line in
+             gapbridge("check", path, "--live").out.splitlines()}  # fmt: skip
+    found = {name: (values[0], values[-1].strip()) for name, values in shown.items()}
+    assert found["quantity"] == ("cell", "controller")
+    assert found["TCP xyz"] == ("[0, 0, 0.25] m", "[0, 0, 0.18] m")
+    assert found["payload"] == ("2 kg", "5 kg")
+    assert found["calibration"][0] == "none"
+    assert found["calibration"][1].startswith("flange within 0.")
+    assert found["rate"][0] == "500 Hz"
+    assert found["rate"][1].startswith("500 Hz, measured ")
 
 
 def test_live_passes_the_controllers_own_cell(host: str, tmp_path: Path) -> None:

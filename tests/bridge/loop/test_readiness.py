@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gapbridge.bridge.loop.checks import GAPS, RateCheck
 from gapbridge.bridge.loop.loop import ModelCheck
 from gapbridge.core.arm import arm_from_dh, builtin_arm
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
+from gapbridge.drivers.rate_check import GAPS, RateCheck
 
 SOFT = [1e-6] * 6
 PULL = Loads(wrench=np.array([[0.0, 0.0, -30.0, 0.0, 0.0, 0.0]]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -185,6 +186,18 @@ def test_options_that_cannot_be_used_are_one_line(
     assert output in done.err
     assert len(done.err.strip().splitlines()) == 1
     assert not (folder / arguments[2]).exists()
+
+
+def test_a_urdf_whose_links_are_a_loop_is_one_line(folder: Path) -> None:
+    text = (folder / "arm.urdf").read_text()
+    loop = '<joint name="back" type="fixed"><parent link="{}"/><child link="{}"/></joint></robot>'
+    parents, children = (re.findall(rf'{tag} link="(\w+)"', text) for tag in ("parent", "child"))
+    root = next(link for link in parents if link not in children)
+    (folder / "arm.urdf").write_text(text.replace("</robot>", loop.format(children[-1], root)))
+    done = patch(folder, "arm.urdf", "--out", "out.urdf")
+    assert done.code == 2
+    assert done.err.startswith("error: arm.urdf: link ")
+    assert done.err.endswith(": found a closed loop, expected a tree\n")
 
 
 def test_further_joints_take_nothing_from_a_models_classes(folder: Path) -> None:

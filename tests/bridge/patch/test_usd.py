@@ -192,10 +192,11 @@ def test_units_of_friction_damping_and_drives(tmp_path: Path) -> None:
     assert any("delay" in line for line in found.unsupported)
 
 
-def test_what_is_no_usd_is_one_line(tmp_path: Path) -> None:
+def test_what_is_no_usd_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.usda").write_text("nothing")
-    with pytest.raises(InputError, match="found no USD that opens") as error:
+    with pytest.raises(InputError, match="found no USD that opens, expected a stage") as error:
         format_of(tmp_path / "a.usda").patch(
             tmp_path / "a.usda", changes_of(NOMINAL), PatchOptions(), []
         )
     assert "\n" not in str(error.value)
+    assert capfd.readouterr().err == ""  # USD itself warns

@@ -277,5 +277,5 @@ def test_too_few_poses_are_said_before_any_is_looked_for(
     parameters: Parameters, space: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gapbridge.core.planning.design.sample_candidates", None)
-    with pytest.raises(PlanError, match="too few poses: found 3, expected at least"):
+    with pytest.raises(PlanError, match=r"calibration\.poses: found 3, expected at least"):
         plan(parameters, POSITION, LOADS, space, poses=3)

@@ -75,6 +75,11 @@ def test_a_mistake_is_reported_with_its_line(
     assert "\n" not in text
 
 
+def test_a_list_is_no_map(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"line 1: found no keys, expected a profile \(name: "):
+        read_profile(written(tmp_path, "- a"))
+
+
 def test_the_good_map_is_taken(tmp_path: Path) -> None:
     compiled = compile_map(read_profile(written(tmp_path, GOOD), 6))
     assert compiled.fast == (Block("holding", 10, 31),)
