@@ -167,3 +167,10 @@ def test_host_is_an_interface_a_serial_port_or_an_address(
 def test_a_cell_is_a_yaml_file(tmp_path: Path) -> None:
     line = refused("init", "127.0.0.1", "--out", tmp_path / "cell.csv")
     assert "cell.csv: found .csv, expected .yaml or .yml" in line
+
+
+def test_a_calibration_is_written_to_a_yaml_file(tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text("robot: {model: ur10e}\n")
+    line = refused("calibrate", cell, "--apply", tmp_path / "log.csv")
+    assert "log.csv: found .csv, expected .yaml or .yml" in line
