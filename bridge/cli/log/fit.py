@@ -56,10 +56,11 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     point alone, which is written), so that they do not bias the flexibilities; diagnose names them.
     Link geometry is not written; if the cell would then predict unseen poses worse, it is kept
     nominal.
-    Declines, with the reason, if nothing in the log excites the compliance. A log of more than
-    20,000 rows, or a recording of the daemon (.mcap), is read in pieces, so that memory does not
-    grow with it. Several logs (or a column session in one) are sessions: each has its own
-    instrument frame, with --remounted also its own tool point, and all share the flexibilities.
+    Declines, with the reason, if nothing in the log excites the compliance, or if its poses are
+    another arm's. A log of more than 20,000 rows, or a recording of the daemon (.mcap), is read in
+    pieces, so that memory does not grow with it. Several logs (or a column session in one) are
+    sessions: each has its own instrument frame, with --remounted also its own tool point, and all
+    share the flexibilities.
 
     Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
     """

@@ -181,3 +181,10 @@ def test_the_arm_is_looked_at_before_the_controller_is_reached(
 
     monkeypatch.setattr("gapbridge.bridge.cli.cell.init.enquire", reached)
     assert phrase in refused("init", "127.0.0.1", option, value, "--out", tmp_path / "new.yaml")
+
+
+def test_a_calibration_is_written_to_a_yaml_file(tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text("robot: {model: ur10e}\n")
+    line = refused("calibrate", cell, "--apply", tmp_path / "log.csv")
+    assert "log.csv: found .csv, expected .yaml or .yml" in line

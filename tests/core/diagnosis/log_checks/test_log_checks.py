@@ -13,7 +13,7 @@ import small_arm as small
 from scipy.spatial.transform import Rotation
 
 from gapbridge.bridge.document.log_findings import log_finding_text
-from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
+from gapbridge.core.diagnosis.log_checks.units_and_clocks import ColumnsAndOrder, check_units
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import findings as log_findings
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
@@ -126,6 +126,16 @@ def test_repeated_and_backward_timestamps_are_counted():
         "1 timestamp(s) are repeated",
         "1 timestamp(s) run backwards (the first is row 12): rows should be in time order",
     ]
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 9])
+def test_rows_out_of_order_are_counted_across_pieces_and_a_new_session_may_restart(rows):
+    time, session = np.array([5.0, 6, 7, 6.5, 8, 0, 1, 0.5, 2]), np.array([1.0] * 5 + [2.0] * 4)
+    log, checked = Log("log.csv", {"timestamp": time, "session": session}, 3), ColumnsAndOrder()
+    for first in range(0, len(time), rows):
+        checked.add(log.select(slice(first, first + rows)))
+    (found,) = checked.findings()
+    assert log_finding_text(found).startswith("2 timestamp(s) run backwards (the first is row 5)")
 
 
 def test_the_clock_of_a_recording_that_repeats_is_reported():
