@@ -33,7 +33,7 @@ class Journal:
         self.entries: list[Entry] = []
         self.torn = False  # the last line was incomplete and has been removed
         self._fd = -1
-        self._made_folder = False
+        self._made: list[Path] = []  # folders, the inner one first
 
     def open(self) -> None:
         """Lock the journal and read its entries.
@@ -42,7 +42,8 @@ class Journal:
         damaged.
         """
         try:
-            self._made_folder = not self.path.parent.exists()
+            folder = self.path.parent
+            self._made = [one for one in (folder, folder.parent) if not one.exists()]
             make_folder(self.path.parent)
             self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, MODE)
             sync_folder(self.path.parent)
@@ -86,11 +87,11 @@ class Journal:
         return entry
 
     def discard(self) -> None:
-        """Remove the file, and its folder if ``open`` made it and nothing else is in it."""
+        """Remove the file, and the folders that ``open`` made and nothing else is in."""
         with contextlib.suppress(OSError):
             self.path.unlink()
-            if self._made_folder:
-                self.path.parent.rmdir()
+            for folder in self._made:
+                folder.rmdir()
 
     def close(self) -> None:
         """Close and unlock the file. May be repeated."""

@@ -221,12 +221,12 @@ def test_unusable_input_is_refused_in_one_line(
     tmp_path: Path, arguments: list[str], changed: dict[str, object], phrase: str
 ) -> None:
     cell = write_cell(tmp_path, **{"poses": 12, **changed})
-    result = run_calibrate(cell, "--session", tmp_path / "s", *arguments)
+    result = run_calibrate(cell, "--session", tmp_path / "all" / "s", *arguments)
     assert result.code == 2, result
     assert phrase in result.err
     assert result.err.count("\n") == 1
     assert "Traceback" not in result.err
-    assert not (tmp_path / "s").exists()  # nothing to resume
+    assert list(tmp_path.iterdir()) == [cell]  # nothing to resume
 
 
 def test_what_a_planned_session_ignores_is_told(clean: tuple[Path, CommandResult]) -> None:

@@ -240,7 +240,7 @@ def test_another_arm_is_refused_by_the_joint_that_does_not_agree(tmp_path: Path)
     ("name", "text", "output"),
     [
         ("a.urdf", "<robot", "broken XML"),
-        ("a.urdf", "<sdf/>", "found <sdf>"),
+        ("a.urdf", "<sdf/>", "found a <sdf> file"),
         ("a.xml", "<mujoco><worldbody><body/></worldbody></mujoco", "no MJCF that compiles"),
         ("a.urdf", "<robot name='x'><link name='a'/></robot>", "joints: found"),
     ],
