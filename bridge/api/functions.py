@@ -83,17 +83,17 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     """Return the joint flexibilities identified from a log; ``gapbridge fit``.
 
     ``remounted``: the target was taken off between sessions. Raises ExcitationError where nothing
-    in the log excites the compliance, LogError where its measured poses are another arm's.
+    in the log excites the compliance.
     """
     from gapbridge.bridge.api.uncertainty import provenance_of_fit
-    from gapbridge.bridge.cell.log_consistency import require_own_arm
+    from gapbridge.bridge.cell.log_consistency import pose_warnings
     from gapbridge.bridge.document.notes import note_texts
     from gapbridge.core.estimation.identification import (
         identify_compliance,  # predict need not wait for it
     )
 
     metrology = replace(cell.metrology, remounted=remounted)
-    warnings = require_own_arm(cell, log, metrology)
+    warnings = pose_warnings(cell, log, metrology)
     estimate = identify_compliance(cell.model, log, metrology)
     held_out = estimate.remaining_rms_held_out
     return Fitted(

@@ -155,14 +155,18 @@ class Diagnosed:
     def save(self, path: Path | str, *, stand_ins: bool = False) -> None:
         """Write the cell with the causes added, as ``--apply`` (``--stand-ins``) does.
 
-        Raises LogError where the measured poses are another arm's.
+        Without causes where the measured poses are another arm's: nothing fitted to them holds.
         """
         from gapbridge.bridge.api.uncertainty import cause_entries, intervals_applied, spread_of
-        from gapbridge.bridge.cell.log_consistency import refuse_other_arm
 
         diagnosis, cell = self.diagnosis, self.cell
-        found = (f for f in diagnosis.findings if isinstance(f, LogFinding))
-        refuse_other_arm(self.log, found)
+        if any(isinstance(f, LogFinding) and f.forbids_fit for f in diagnosis.findings):
+            origin = fitted(
+                self.document["provenance"], cell.fitted_range, cell.spread, cell.intervals,
+                [entry.model_dump() for entry in cell.causes],
+            )  # fmt: skip
+            _save(cell, path, cell.model, origin)
+            return
         spread = spread_of(diagnosis).beside(cell.spread)
         origin = fitted(
             self.document["provenance"], range_of(self.log), spread,

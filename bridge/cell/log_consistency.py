@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 from gapbridge.bridge.cell.cell import Cell
@@ -60,18 +59,6 @@ def pose_findings(cell: Cell, log: Log, metrology: Metrology | None = None) -> l
     return list(found)
 
 
-def require_own_arm(cell: Cell, log: Log, metrology: Metrology) -> list[str]:
-    """Return how the measured poses contradict the cell, where a fit holds all the same.
-
-    Raises LogError where nothing that is fitted to them holds.
-    """
-    found = pose_findings(cell, log, metrology)
-    refuse_other_arm(log, found)
-    return [log_finding_text(finding) for finding in found]
-
-
-def refuse_other_arm(log: Log, findings: Iterable[LogFinding]) -> None:
-    """Raise LogError for a finding by which nothing that is fitted to the log's poses holds."""
-    for finding in findings:
-        if finding.forbids_fit:
-            raise LogError(f"{log.path}: {log_finding_text(finding)}; nothing is written")
+def pose_warnings(cell: Cell, log: Log, metrology: Metrology) -> list[str]:
+    """Return how the measured poses contradict the cell, as texts."""
+    return [log_finding_text(finding) for finding in pose_findings(cell, log, metrology)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,6 @@ import click
 
 from gapbridge.bridge import api
 from gapbridge.bridge.api.records import REPORT_FILES
-from gapbridge.bridge.cell.log_consistency import require_own_arm
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text, wrong_arm_findings
 from gapbridge.bridge.cli.options import (
@@ -95,8 +94,6 @@ def diagnose(
     rows = open_logs(logs, opened, warn=len(logs) > 1)
     warn_outside(rows, opened)
     require_effects(withhold)
-    if output.new_cell is not None:  # before the work
-        require_own_arm(opened, rows, replace(opened.metrology, remounted=remounted))
     simulated = None if sim is None else open_log(sim, opened)
     output.require_writable(*logs, cell, *([sim] if sim else []))
     with status("diagnosing") as emit:
@@ -105,7 +102,10 @@ def diagnose(
             progress=emit,
         )  # fmt: skip
     for finding in wrong_arm_findings(found.diagnosis):
-        click.echo(f"warning: {rows.path}: {log_finding_text(finding)}", err=True)
+        text = log_finding_text(finding)
+        if output.new_cell is not None and finding.forbids_fit:
+            text += "; no cause is written into the cell"
+        click.echo(f"warning: {rows.path}: {text}", err=True)
     written = output.write(found)  # before the text: its reader may leave early
     click.echo(diagnosis_text(found.diagnosis))
     for file in written:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from gapbridge.bridge.api.uncertainty import provenance_of_fit
 from gapbridge.bridge.cell import Cell, save_cell
-from gapbridge.bridge.cell.log_consistency import require_own_arm
+from gapbridge.bridge.cell.log_consistency import pose_warnings
 from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
 from gapbridge.bridge.cli.options import (
     FILE,
@@ -56,11 +56,10 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     point alone, which is written), so that they do not bias the flexibilities; diagnose names them.
     Link geometry is not written; if the cell would then predict unseen poses worse, it is kept
     nominal.
-    Declines, with the reason, if nothing in the log excites the compliance, or if its poses are
-    another arm's. A log of more than 20,000 rows, or a recording of the daemon (.mcap), is read in
-    pieces, so that memory does not grow with it. Several logs (or a column session in one) are
-    sessions: each has its own instrument frame, with --remounted also its own tool point, and all
-    share the flexibilities.
+    Declines, with the reason, if nothing in the log excites the compliance. A log of more than
+    20,000 rows, or a recording of the daemon (.mcap), is read in pieces, so that memory does not
+    grow with it. Several logs (or a column session in one) are sessions: each has its own
+    instrument frame, with --remounted also its own tool point, and all share the flexibilities.
 
     Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
     """
@@ -104,7 +103,7 @@ def _identified(
             pieces: Iterable[Log] = LargeLog(paths[0], cell, by_approach(cell.model.terms))
             for piece in pieces if ranges else with_log_warnings(pieces):
                 if not ranges:
-                    warnings.extend(require_own_arm(cell, piece, metrology))
+                    warnings.extend(pose_warnings(cell, piece, metrology))
                 ranges.append(range_of(piece))
                 yield piece
 
@@ -112,7 +111,7 @@ def _identified(
             estimate = identify_streamed(cell.model, read_once(), metrology, progress=emit)
         return estimate, warnings, merged(ranges)
     rows = open_logs(paths, cell, warn=True)
-    warnings = require_own_arm(cell, rows, metrology)
+    warnings = pose_warnings(cell, rows, metrology)
     with progress("fitting"):
         estimate = identify_compliance(cell.model, rows, metrology)
     return estimate, warnings, range_of(rows)
