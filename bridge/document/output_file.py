@@ -72,10 +72,11 @@ def require_table(path: Path, *inputs: Path) -> Path:
 def require_cell(path: Path, *others: Path) -> Path:
     """Return the path if a cell can be written there; see ``require_writable``.
 
-    Raises InputError also where its suffix is not that of YAML: a log or a report named by mistake
-    would be lost.
+    Raises InputError also for a file that exists with another suffix than YAML's: a log or a report
+    named by mistake would be lost.
     """
-    return require_suffix(require_writable(path, *others), YAML)
+    require_writable(path, *others)
+    return require_suffix(path, YAML) if path.exists() and path.suffix else path
 
 
 def require_suffix(path: Path, suffixes: Sequence[str]) -> Path:

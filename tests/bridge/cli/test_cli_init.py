@@ -164,11 +164,6 @@ def test_host_is_an_interface_a_serial_port_or_an_address(
     assert found == {"driver": driver, "profile": "arm", **where}
 
 
-def test_a_cell_is_a_yaml_file(tmp_path: Path) -> None:
-    line = refused("init", "127.0.0.1", "--out", tmp_path / "cell.csv")
-    assert "cell.csv: found .csv, expected .yaml or .yml" in line
-
-
 @pytest.mark.parametrize(
     ("option", "value", "phrase"),
     [("--urdf", "none.urdf", "file not found"), ("--model", "ur99", "found 'ur99'")],
@@ -183,8 +178,9 @@ def test_the_arm_is_looked_at_before_the_controller_is_reached(
     assert phrase in refused("init", "127.0.0.1", option, value, "--out", tmp_path / "new.yaml")
 
 
-def test_a_calibration_is_written_to_a_yaml_file(tmp_path: Path) -> None:
+def test_a_calibrated_cell_replaces_no_log(tmp_path: Path) -> None:
     cell = tmp_path / "cell.yaml"
+    (tmp_path / "log.csv").write_text("a\n1\n")
     cell.write_text("robot: {model: ur10e}\n")
     line = refused("calibrate", cell, "--apply", tmp_path / "log.csv")
     assert "log.csv: found .csv, expected .yaml or .yml" in line
