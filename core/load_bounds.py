@@ -18,7 +18,7 @@ DEFAULT_RATED = 10.0  # kg, rated payload where the links' masses are unknown to
 GRAVITY = 9.80665  # m/s^2
 MAX_FORCE, MAX_MOMENT = 1e4, 1e4  # N, Nm on a tool: no arm is pushed harder
 WRENCH = (MAX_FORCE,) * 3 + (MAX_MOMENT,) * 3
-LEAST = -1e-9  # kg, of declared mass and effects together: less than zero by rounding alone
+NEGATIVE_SHARE = 0.1  # of the rated payload, by which an estimated load may be below zero
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,11 @@ class LoadBounds:
             return cls(float(model.arm.payload))
         by_mass = MASS_SHARE * float(np.sum(model.arm.mass))
         return cls(max(by_mass if by_mass > 0.0 else DEFAULT_RATED, float(model.payload_mass)))
+
+    @property
+    def least(self) -> float:
+        """Return the least payload with what effects add to it, kg: estimates may be below zero."""
+        return -NEGATIVE_SHARE * self.rated
 
     @property
     def mass(self) -> float:

@@ -29,7 +29,7 @@ from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.effects import Term
 from gapbridge.core.errors import ArmError, CellError, EquilibriumError, InputError, Keys
 from gapbridge.core.files import Document
-from gapbridge.core.load_bounds import LEAST, PAYLOAD_FACTOR
+from gapbridge.core.load_bounds import PAYLOAD_FACTOR, LoadBounds
 from gapbridge.core.loads import Loads
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Uncertain
@@ -151,7 +151,7 @@ class Cell:
     def payload_problem(self) -> InputError | None:
         """Return the error of effects that leave less than no load on the flange; None: none."""
         mass, added = self.model.payload_mass, self.model.added_mass
-        if mass + added >= LEAST:
+        if mass + added >= LoadBounds.of(self.model).least:
             return None
         return self.error(
             ("payload", "mass"),

@@ -13,7 +13,7 @@ from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
 from gapbridge.core.errors import LogError, LogOptionError
-from gapbridge.core.load_bounds import LEAST, PAYLOAD_FACTOR, WRENCH
+from gapbridge.core.load_bounds import PAYLOAD_FACTOR, WRENCH, LoadBounds
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.sources import SourceOptions, source_of
 from gapbridge.core.notes import Note
@@ -93,7 +93,7 @@ def check_log(log: Log, cell: Cell) -> None:
     if mass is None:
         if (problem := cell.payload_problem) is not None:
             raise problem
-    elif (below := (mass >= 0.0) & (mass + added < LEAST)).any():
+    elif (below := (mass >= 0.0) & (mass + added < LoadBounds.of(cell.model).least)).any():
         row = int(np.argmax(below))
         raise LogError(
             f"{log.path}: row {log.line(row)}, column payload: found {mass[row]:g} kg and "
