@@ -21,6 +21,7 @@ import numpy as np
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.criteria import MIN_SEPARATION
+from gapbridge.core.diagnosis.finding import Check
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.ties import tied
 from gapbridge.core.dynamics import (
@@ -88,7 +89,7 @@ def next_measurements(
             continue
         trials = drawn if moving else drawn.at_rest
         predict = PREDICTORS[channel.channel](model, trials)
-        sigma = channel.noise_floor_rms or channel.selection.observation.sigma or 1e-5
+        sigma = _noise(channel)
         for question in _open_questions(model, channel, predict):
             difference = _difference(channel, predict, question)
             if difference is None:
@@ -98,13 +99,24 @@ def next_measurements(
     return tuple(chosen)
 
 
+def _noise(channel: ChannelDiagnosis) -> float:
+    """Return a channel's noise, rms of a coordinate; of its search where no floor is known."""
+    selection = channel.selection
+    if known := channel.noise_floor_rms or selection.observation.sigma:
+        return known
+    spread = np.diagonal(selection.unwhitener(), axis1=1, axis2=2) * selection.observation.weight
+    return float(np.sqrt(np.mean(spread**2))) or 1e-5
+
+
 def _open_questions(
     model: Model, channel: ChannelDiagnosis, predict: Predict
 ) -> Iterator[_OpenQuestion]:
-    """Yield the ties of accused effects, and the effects that the log does not excite."""
+    """Yield the ties of effects, accused or for that not, and effects that the log lacks."""
     selection = channel.selection
     space, best = selection.working, selection.best
-    for position in channel.judgement.accused:
+    judgement = channel.judgement
+    separated = [p for p, why in judgement.withdrawn if why.failed is Check.SEPARATED]
+    for position in (*judgement.accused, *separated):
         accused_candidate = selection.term_index[position]
         if accused_candidate in selection.block:  # no rivals
             continue
