@@ -98,16 +98,14 @@ for i in range(250):
     c.waitPeriod(t)
 out["servo"] = near(goal)
 out["stopped"] = c.servoStop()
-for i in range(100):
-    t = c.initPeriod()
-    assert c.speedJ([0.0, 0.0, 0.0, 0.0, 0.0, 0.5], 5.0, 0.0)
-    c.waitPeriod(t)
+def commanded(send, read, goal):
+    assert send()
+    return abs(read() - goal) < 0.001
+turn, lift = [0.0, 0.0, 0.0, 0.0, 0.0, 0.5], [0.0, 0.0, 0.05, 0.0, 0.0, 0.0]
+until(lambda: commanded(lambda: c.speedJ(turn, 5.0, 0.0), lambda: r.getActualQd()[5], 0.5))
 out["speed"] = r.getActualQd()[5]
 out["speed_stopped"] = c.speedStop()
-for i in range(100):
-    t = c.initPeriod()
-    assert c.speedL([0.0, 0.0, 0.05, 0.0, 0.0, 0.0], 1.0, 0.0)
-    c.waitPeriod(t)
+until(lambda: commanded(lambda: c.speedL(lift, 1.0, 0.0), lambda: r.getActualTCPSpeed()[2], 0.05))
 out["tool_speed"] = r.getActualTCPSpeed()
 c.speedStop()
 pose = r.getActualTCPPose()
