@@ -35,6 +35,7 @@ def assert_came_back_observing(run: Run, robot: Robot) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.realtime(limit=0.2)  # the cell's hang_timeout: a later machine ends further loops
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Signals) -> None:
     with Run(robot.cell(), arm=True) as run:

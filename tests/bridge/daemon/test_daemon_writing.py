@@ -149,6 +149,7 @@ def settled_error(robot: Robot, wanted: np.ndarray, patience: float = 15.0) -> f
     return error
 
 
+@pytest.mark.realtime(limit=0.03)  # later than that, stale states have ended the motion
 def test_offset_mode_corrects_under_the_robots_own_program(robot: Robot) -> None:
     program = robot.start_offset_program()
     cell = robot.cell(link=", mode: offset")

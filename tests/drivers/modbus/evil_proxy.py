@@ -45,4 +45,6 @@ class EvilProxy:
         return self
 
     def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread: the number is used again
         self._listener.close()

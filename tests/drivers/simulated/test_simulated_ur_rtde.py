@@ -333,8 +333,13 @@ try:
     d.unlockProtectiveStop()
 except Exception as error:
     out["early"] = str(error)
-time.sleep(5.1)
-d.unlockProtectiveStop()
+def unlocked():
+    try:
+        d.unlockProtectiveStop()
+    except RuntimeError:
+        return False
+    return True
+until(unlocked)
 until(lambda: not r.isProtectiveStopped())
 out["released"] = [r.isProtectiveStopped(), r.getSafetyMode(), r.getRuntimeState()]
 c.reuploadScript()
