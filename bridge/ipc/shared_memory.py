@@ -271,8 +271,9 @@ class RunMemory(SharedMemory):
         """Show the memory to readers once its loop has sealed it; returns whether it has."""
         if self._is_shown or not is_sealed(self.fd):
             return False
-        os.close(self._shown)
-        self._shown, self._is_shown = os.dup(self.fd), True
+        # in one step: the number is never another file's, whoever opens it and wherever this ends
+        os.dup2(self.fd, self._shown, inheritable=False)
+        self._is_shown = True
         return True
 
     def open_for_reading(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import subprocess
@@ -87,6 +88,22 @@ def test_memory_is_shown_once_its_loop_alone_can_write_to_it(run: RunMemory) -> 
     assert os.path.sameopenfile(run.fd, run.open_for_reading())
     with pytest.raises(PermissionError):
         SharedMemory(2, os.dup(run.fd), clock=SYSTEM)
+    loop.close()
+
+
+def test_what_is_shown_is_never_a_closed_file(
+    run: RunMemory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where no descriptor is left (EMFILE), or the daemon ends between two steps."""
+
+    def none_left(_: int) -> int:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    run.renew()
+    loop = SharedMemory(2, os.dup(run.fd), clock=SYSTEM)
+    monkeypatch.setattr(os, "dup", none_left)
+    assert run.promote()
+    assert os.path.sameopenfile(run.fd, run.open_for_reading())
     loop.close()
 
 
