@@ -9,7 +9,8 @@ from typing import Any
 
 from benchmarks.faults.punctual import go_first
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.daemon.daemon import Daemon, settings_of
+from gapbridge.bridge.cell.run_settings import settings_of
+from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.drivers.clock import SYSTEM

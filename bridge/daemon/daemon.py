@@ -18,13 +18,14 @@ from pathlib import Path
 from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.cell.run_settings import Configuration, configuration_for, settings_of
+from gapbridge.bridge.cell.run_settings import Configuration, configuration_for
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.fitted_watch import FittedWatch
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.reload import Reload
+from gapbridge.bridge.daemon.requests import Requests
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.daemon.side_processes import SideProcesses
 from gapbridge.bridge.daemon.status import DaemonStatus
@@ -45,8 +46,6 @@ from gapbridge.bridge.recording.folder import LOOP_LOG, new_session
 from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.controller_address import address_of
-
-__all__ = ["Daemon", "Say", "settings_of"]
 
 TICK = 0.02  # s between two checks of the loop
 HEALTHY = 10.0  # s of running after which the backoff is reset
@@ -82,9 +81,7 @@ class Daemon:
         n = self.configuration.n
         self.memory = RunMemory(n, clock)  # of the present process of the loop
         self._commands = CommandMemory()  # one for the whole run; only the daemon can write
-        self._requests: queue.SimpleQueue[tuple[int, Command, str]] = queue.SimpleQueue()
         self._last_taken = 0
-        self._request_lock = threading.RLock()
         self._reader = self.memory.reader()
         self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
         self.side_processes = SideProcesses(clock)
@@ -100,13 +97,17 @@ class Daemon:
             configuration, self.memory.slices, self._status, self.event_log.add,
             self._commands.ask, clock,
         )  # fmt: skip
+        self._requests = Requests(
+            self._commands, self.event_log.add, lambda: self._status.zero_moved,
+            self._zeros.obstacle_to,
+        )  # fmt: skip
         self._status_at = 0.0
         self._reload = Reload(self.manager, self.event_log)
         self.control = Control(self, clock)
         self.loop: LoopProcess | None = None
         self._failure: Event = {}
         self._faults: list[tuple[str, str]] = []  # cause, text
-        self._lost_rows = 0
+        self.lost_rows = 0  # cycles that the recorder has lost
         self._refused = False  # arming was requested and refused
         self._has_state = False  # a state has been read in this run
         self._ends_at = float("inf")  # s, monotonic: end of a run with a duration
@@ -167,11 +168,6 @@ class Daemon:
         folder = self.settings.recording.folder
         return None if folder is None or not self.session else folder / self.session
 
-    @property
-    def lost_rows(self) -> int:
-        """Return how many cycles the recorder has lost."""
-        return self._lost_rows
-
     def events_since(self, sequence: int) -> list[Event]:
         """Return the events after a number."""
         return self.event_log.since(sequence)
@@ -180,6 +176,8 @@ class Daemon:
         """Return the status document; may be called from any thread."""
         status, tally, recording = self._status, self.tally, self.recording
         counted = self.memory.counts()
+        dropped = {reason.value: counted[count.label] for reason, count in DROPPED.items()}
+        loop = {"pid": self.loop_pid, "restarts": self.restarts, "phase": self.phase.name.lower()}
         return {
             "schema": SCHEMA,
             "time": self._clock.time(),
@@ -196,18 +194,12 @@ class Daemon:
             "latched": status.latched,
             "correction": status.correction,
             "zeros": self._zeros.slips.detail,
-            "loop": {
-                "pid": self.loop_pid,
-                "restarts": self.restarts,
-                "phase": self.phase.name.lower(),
-            },
+            "loop": loop,
             "link": {
                 "driver": self.settings.link.driver,
                 **status.link(),
                 **tally.counts.totals(),
-                "dropped": {
-                    reason.value: counted[count.label] for reason, count in DROPPED.items()
-                },
+                "dropped": dropped,
             },
             "counts": counted,
             "events": dict(self.event_log.counts),
@@ -243,7 +235,7 @@ class Daemon:
         """Request writing; returns the request's number, 0 if it cannot be made."""
         if self.loop is None or not self.may_write:
             return 0
-        return self._request(Command.ARM, by)
+        return self._requests.make(Command.ARM, by)
 
     def disarm(self, by: str = PROGRAM) -> int:
         """Request ramping out and observing, from this loop or the next; acknowledge a fault.
@@ -251,32 +243,7 @@ class Daemon:
         A fault that occurs after this call is not acknowledged. Returns the request's number: the
         loop has received it once ``last_taken`` reaches it.
         """
-        return self._request(Command.DISARM if self.latched else Command.RAMP_OUT, by)
-
-    def _request(self, command: Command, by: str) -> int:
-        with self._request_lock:
-            number = self._commands.number()
-            self._requests.put((number, command, by))
-        return number
-
-    def _forward_requests(self) -> None:
-        """Pass requests to the loop, each after an event that names the requester.
-
-        Only this method writes an ARM command.
-        """
-        while not self._requests.empty():
-            number, command, by = self._requests.get()
-            name = "arm" if command == Command.ARM else "disarm"
-            detail = f"{name} requested by {by}"
-            moved = self._status.zero_moved
-            self.event_log.add(
-                {"kind": EventKind.REQUEST, "command": name, "number": number, "by": by,
-                 "acknowledges": command == Command.DISARM, "detail": detail}
-            )  # fmt: skip
-            if obstacle := self._zeros.obstacle_to(command, moved):
-                self.event_log.add({"kind": EventKind.REFUSED, "what": name, "detail": obstacle})
-                continue
-            self._commands.ask(command, number)
+        return self._requests.make(Command.DISARM if self.latched else Command.RAMP_OUT, by)
 
     # -- the run ----------------------------------------------------------------------------------
 
@@ -348,13 +315,8 @@ class Daemon:
         self._lock, self._noted = lock, str(lock.before.get("latched", ""))
         self._status.restore(self._noted)
         # after a crash --arm from a terminal may arm, a restarted service may not
-        if arm and (lock.before or lock.problem) and (by != "--arm" or self.manager.present):
-            pid = lock.before.get("pid")
-            process = f" (process {pid})" if pid else ""
-            why = f"the run before{process} did not end in order"
-            if not lock.before:
-                why = f"how the run before ended is not known: {lock.problem}"
-            detail = f"{why}: not arming by itself; gapbridge arm"
+        if arm and lock.disorder and (by != "--arm" or self.manager.present):
+            detail = f"{lock.disorder}: not arming by itself; gapbridge arm"
             self.event_log.add({"kind": EventKind.REFUSED, "detail": detail})
             return False
         return arm
@@ -378,7 +340,7 @@ class Daemon:
         if self._clock.monotonic() >= self._ends_at:
             self._stopping.set()
         self._read_loop()
-        self._forward_requests()
+        self._requests.forward()
         if self.memory.promote():
             self.side_processes.show(self.memory)
         for event in self.side_processes.check():
@@ -442,20 +404,15 @@ class Daemon:
 
         In addition, requests other than to arm that no loop has received are repeated.
         """
-        with self._request_lock:  # no request is numbered and not yet written
-            self._forward_requests()
-            after = self._commands.number()
+        after = self._requests.forward_all()
         order = {
             "may_write": self.may_write, "number": self._loops, "latched": self._status.latched,
             "after": after,
         }  # fmt: skip
-        kept = (Command.DISARM, Command.RAMP_OUT, Command.ZERO_MOVED)
-        for command in sorted(kept, key=self._commands.last_of):
-            if self._commands.last_of(command) > self.memory.last_taken:
-                self._commands.ask(command)
+        self._requests.repeat(self.memory.last_taken)
         if armed_by and self.may_write:
-            self._request(Command.ARM, armed_by)
-            self._forward_requests()
+            self._requests.make(Command.ARM, armed_by)
+            self._requests.forward()
         self._loops += 1
         return self.loop_process(
             self.configuration, self.memory, self._commands, order, self._output, self._clock
@@ -492,7 +449,7 @@ class Daemon:
         if kind == EventKind.REFUSED:
             self._refused = True
         if kind == EventKind.RECORDER:
-            self._lost_rows += int(event.get("lost", 0))
+            self.lost_rows += int(event.get("lost", 0))
         if kind == EventKind.TRANSITION:
             tail = f": {detail}" if detail else ""
             text = f"{event['from'].lower()} -> {event['to'].lower()} ({event['cause']}){tail}"

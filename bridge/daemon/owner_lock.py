@@ -106,6 +106,15 @@ class OwnerLock:
                 os.pwrite(self._fd, data, 0)
                 os.ftruncate(self._fd, len(data))
 
+    @property
+    def disorder(self) -> str:
+        """Return why the run before may not have ended in order, as text; empty: it has."""
+        if self.before:
+            pid = self.before.get("pid")
+            process = f" (process {pid})" if pid else ""
+            return f"the run before{process} did not end in order"
+        return f"how the run before ended is not known: {self.problem}" if self.problem else ""
+
     def release(self) -> None:
         """Release the lock after a normal end."""
         self._write("")

@@ -10,7 +10,8 @@ from typing import NamedTuple, Self
 
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.daemon.daemon import Daemon, settings_of
+from gapbridge.bridge.cell.run_settings import settings_of
+from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.demo.bench import Tracker
 from gapbridge.bridge.demo.links.link import DemoLink

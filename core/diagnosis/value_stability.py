@@ -31,7 +31,7 @@ from gapbridge.core.diagnosis.criteria import (
     STAND_IN_GAIN,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.observation import HELD_TORQUE, Observation
+from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import parts, regions
 from gapbridge.core.diagnosis.selection.candidate import Candidate, target_of
 from gapbridge.core.diagnosis.selection.delay_columns import shrunk_to_common_delay
@@ -216,7 +216,7 @@ class _UnnamedFunctions:
         tracking = selection.observation.channel == "tracking"
         self._forms = {
             c: basis_of(self.space.columns([c])) for c in unnamed
-            if tracking and _of_held_torque(self.space.candidates[c])
+            if tracking and self.space.candidates[c].of_held_torque
         }  # fmt: skip
         size = np.diff(self.space.start)[self._index]
         self._penalty = size * np.log(self.space.freedom) + 2 * np.log(max(len(unnamed), 2))
@@ -378,7 +378,7 @@ class _UnnamedFunctions:
         contained: dict[int, Mask] = {}
         for c in chosen:
             k = space.candidates[c]
-            if not (k.without_quantity or _of_own_speed(k) or c in self._forms):
+            if not (k.without_quantity or k.of_own_speed or c in self._forms):
                 continue
             U = basis_of(space.columns([c]))
             inside = np.einsum("ij,ij->j", U.T @ X, U.T @ X) > CONTAINED_SHARE
@@ -494,17 +494,5 @@ def _models_unknown(candidate: Candidate, observation: Observation) -> bool:
     if observation.channel == "tracking":
         return True
     if observation.channel == "torque":
-        return not _of_own_speed(candidate)
+        return not candidate.of_own_speed
     return candidate.target != target_of(candidate.quantity, "approach")
-
-
-def _of_held_torque(candidate: Candidate) -> bool:
-    """Return whether a candidate moves a joint by a function of the torque that it holds."""
-    own = target_of(candidate.quantity, HELD_TORQUE)
-    return bool(own) and candidate.target == own
-
-
-def _of_own_speed(candidate: Candidate) -> bool:
-    """Return whether a candidate moves a joint by a function of its own speed."""
-    own = target_of(candidate.quantity, "actual_qd", "target_qd")
-    return bool(own) and candidate.target == own

@@ -25,7 +25,7 @@ from gapbridge.core.estimation.registration import (
     frame_columns,
     register_robustly,
 )
-from gapbridge.core.estimation.robust import FULL_WEIGHT, distance_of, scale_of, weights_of
+from gapbridge.core.estimation.robust import robust_weights, whitening_factors
 from gapbridge.core.kernels.factor import factor_blocks
 from gapbridge.core.kernels.threads import in_ranges
 from gapbridge.core.loads import Loads
@@ -496,30 +496,3 @@ def with_step(
         return shifted(model, tool_steps[0]), replace(frame, frames=frames)
     shifts = tuple(a + b for a, b in zip(frame.tool_shift, tool_steps, strict=True))
     return model, Placements(frames, shifts)
-
-
-def whitening_factors(weights: Array, scale: Array, width: int) -> Array:
-    """Return the factor (N, width) of each equation: root of the weight over the noise."""
-    return np.asarray(np.sqrt(weights)[:, None] / np.repeat(scale, 3)[:width])
-
-
-def robust_weights(gap: Array) -> tuple[Array, Array]:
-    """Return the weights (N,) of gaps (N, 3 or 6), and their noise (2,), m and rad."""
-    scale = noise_of(gap)
-    return weights_at(gap, scale), scale
-
-
-def noise_of(gap: Array) -> Array:
-    """Return the noise (2,), m and rad, of gaps (N, 3 or 6).
-
-    At least a third of the rows are inliers with it: of a gap in one direction only (a base whose
-    height is wrong) the median coordinate shows nothing.
-    """
-    scale = np.array([scale_of(gap[:, :3]), scale_of(gap[:, 3:]) if gap.shape[1] > 3 else 1.0])
-    distance = distance_of(gap, np.repeat(scale, 3)[: gap.shape[1]])
-    return np.asarray(scale * max(float(np.quantile(distance, 1 / 3)) / FULL_WEIGHT, 1.0))
-
-
-def weights_at(gap: Array, scale: Array) -> Array:
-    """Return the weights (N,) of gaps (N, 3 or 6) where the noise is ``scale`` (2,)."""
-    return weights_of(distance_of(gap, np.repeat(scale, 3)[: gap.shape[1]]))

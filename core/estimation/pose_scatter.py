@@ -18,11 +18,10 @@ from gapbridge.core.estimation.compliance_fit import (
     nuisance_columns,
     regressor,
     residual,
-    robust_weights,
-    whitening_factors,
 )
 from gapbridge.core.estimation.held_out import jackknife, leave_one_out, pose_groups, random_folds
 from gapbridge.core.estimation.least_squares import inverse
+from gapbridge.core.estimation.robust import robust_weights, whitening_factors
 
 POSE_PARTS = 50  # groups of poses, left out in turn: determines a std to 10 %
 MAX_ROWS = 2000  # used for the jackknife

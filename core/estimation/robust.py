@@ -105,3 +105,33 @@ def _noise(
     spare = weight - np.einsum("ij,ij->i", Q, Q)
     freedom = np.maximum(np.bincount(unit, spare, units), 0.5)
     return np.maximum(np.sqrt(np.bincount(unit, weight * left**2, units) / freedom), TINY), freedom
+
+
+# -- gaps of poses, in m and rad -------------------------------------------------------------------
+
+
+def whitening_factors(weights: Array, scale: Array, width: int) -> Array:
+    """Return the factor (N, width) of each equation: root of the weight over the noise."""
+    return np.asarray(np.sqrt(weights)[:, None] / np.repeat(scale, 3)[:width])
+
+
+def robust_weights(gap: Array) -> tuple[Array, Array]:
+    """Return the weights (N,) of gaps (N, 3 or 6), and their noise (2,), m and rad."""
+    scale = noise_of(gap)
+    return weights_at(gap, scale), scale
+
+
+def noise_of(gap: Array) -> Array:
+    """Return the noise (2,), m and rad, of gaps (N, 3 or 6).
+
+    At least a third of the rows are inliers with it: of a gap in one direction only (a base whose
+    height is wrong) the median coordinate shows nothing.
+    """
+    scale = np.array([scale_of(gap[:, :3]), scale_of(gap[:, 3:]) if gap.shape[1] > 3 else 1.0])
+    distance = distance_of(gap, np.repeat(scale, 3)[: gap.shape[1]])
+    return np.asarray(scale * max(float(np.quantile(distance, 1 / 3)) / FULL_WEIGHT, 1.0))
+
+
+def weights_at(gap: Array, scale: Array) -> Array:
+    """Return the weights (N,) of gaps (N, 3 or 6) where the noise is ``scale`` (2,)."""
+    return weights_of(distance_of(gap, np.repeat(scale, 3)[: gap.shape[1]]))

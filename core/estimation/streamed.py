@@ -33,7 +33,6 @@ from gapbridge.core.estimation.compliance_fit import (
     projected,
     residual,
     solve,
-    weights_at,
     with_free_geometry,
 )
 from gapbridge.core.estimation.geometry import Geometry
@@ -46,6 +45,7 @@ from gapbridge.core.estimation.identification import (
     tool_determined,
 )
 from gapbridge.core.estimation.pose_scatter import with_pose_scatter
+from gapbridge.core.estimation.robust import weights_at
 from gapbridge.core.estimation.streamed_fit import (
     NO_WEIGHTS,
     Accumulated,

@@ -20,14 +20,12 @@ from gapbridge.core.estimation.compliance_fit import (
     Fit,
     add_rows,
     fold_rows,
-    noise_of,
     residual,
-    weights_at,
-    whitening_factors,
     with_step,
 )
 from gapbridge.core.estimation.held_out import FOLDS
 from gapbridge.core.estimation.least_squares import solve
+from gapbridge.core.estimation.robust import noise_of, weights_at, whitening_factors
 
 NO_WEIGHTS = np.zeros(0)  # of a fit to rows that are not stored
 

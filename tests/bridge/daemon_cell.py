@@ -21,7 +21,8 @@ from simulated_controller import SimulatedController
 
 from benchmarks.server_thread import OFFSET_SCRIPT
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.daemon.daemon import Daemon, settings_of
+from gapbridge.bridge.cell.run_settings import settings_of
+from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.log.mcap_reading import read_columns

@@ -18,9 +18,10 @@ from gapbridge.bridge.calibration.instruments.instrument import ReadingError
 from gapbridge.bridge.calibration.joints.joint_source import JointSample, JointSource
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.run_settings import settings_of
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
-from gapbridge.bridge.daemon.daemon import Daemon, settings_of
+from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import CycleReader, Phase
 from gapbridge.bridge.setpoint_source.quintic import quintic, quintic_time, write_trajectory

@@ -16,7 +16,7 @@ import numpy as np
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import MIN_CYCLES
-from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.observation import HELD_TORQUE, Observation
 from gapbridge.core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from gapbridge.core.errors import InputError
 
@@ -73,6 +73,18 @@ class Candidate:
     def without_quantity(self) -> bool:
         """Return whether this is an unnamed cause that is no function of a quantity."""
         return not self.named and not self.quantity
+
+    @property
+    def of_held_torque(self) -> bool:
+        """Return whether this moves a joint by a function of the torque that it holds."""
+        own = target_of(self.quantity, HELD_TORQUE)
+        return bool(own) and self.target == own
+
+    @property
+    def of_own_speed(self) -> bool:
+        """Return whether this moves a joint by a function of its own speed."""
+        own = target_of(self.quantity, "actual_qd", "target_qd")
+        return bool(own) and self.target == own
 
     def term(self, x: Array) -> Term:
         """Return the term with fitted values ``x`` (d,)."""
