@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from clock_by_hand import ByHand
 from test_replayed_refusals import CELL, HOME, N
 
 from gapbridge.bridge.cell import load_cell
@@ -33,9 +34,9 @@ class Stopping(Driver):
     """A controller that ends its program at a stop, which its next state reports; or is gone."""
 
     def __init__(self, commands: CommandMemory, model: Model, after: Modes | str):
-        super().__init__(20.0, model, moves_arm=False)  # no deadline that a busy machine misses
+        self._time = ByHand()  # goes on by a cycle where a state is read
+        super().__init__(20.0, model, moves_arm=False, clock=self._time)
         self._commands, self._after, self._cycle = commands, after, 0
-        self.gate.set_clock(lambda: 0.002 * self._cycle)
 
     def connect(self) -> None: ...
 
@@ -43,6 +44,7 @@ class Stopping(Driver):
 
     def _read_state(self) -> RobotState:
         self._cycle += 1
+        self._time.sleep(0.002)
         if self._cycle == 20:
             self._commands.ask(Command.ARM)
         is_after = self._cycle > FAILS_AT
@@ -50,7 +52,7 @@ class Stopping(Driver):
             raise StaleStateError(self._after)
         q = HOME + 0.1 * np.sin(0.002 * self._cycle + np.arange(N))
         state = RobotState(
-            timestamp=0.002 * self._cycle, received=SYSTEM.monotonic(), actual_q=q,
+            timestamp=0.002 * self._cycle, received=self._time.now, actual_q=q,
             actual_qd=np.zeros(N), target_q=q, actual_TCP_force=np.zeros(6), payload=4.0,
             payload_cog=np.array([0.0, 0.0, 0.06]),
         )  # fmt: skip

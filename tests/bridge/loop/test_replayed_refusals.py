@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import itertools
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from clock_by_hand import ByHand
 from test_replayed_loop import assert_same_bits
 
 from gapbridge.bridge.cell import load_cell
@@ -43,9 +43,8 @@ class Scripted(Driver):
     """A controller whose own program swings the arm, with mishaps at known cycles."""
 
     def __init__(self, cycles: int, commands: CommandMemory, model: Model) -> None:
-        super().__init__(20.0, model, moves_arm=False)  # no deadline that a busy machine misses
-        self._now = 0.0  # s, of the script
-        self.gate.set_clock(lambda: self._now)
+        self._time = ByHand()  # the script's
+        super().__init__(20.0, model, moves_arm=False, clock=self._time)
         self._count = iter(range(cycles))
         self._commands = commands
         self._writes = itertools.count(1)
@@ -67,13 +66,14 @@ class Scripted(Driver):
             self._commands.ask(Command.DISARM)
         if k in (20, 900):
             self._commands.ask(Command.ARM)
-        t = self._now = 0.002 * k + (3.0 if k > 1300 else 0.0)  # a gap
+        t = 0.002 * k + (3.0 if k > 1300 else 0.0)  # a gap
+        self._time.now = 100.0 + t
         q = HOME + 0.2 * np.sin(t + np.arange(N))
         target = q + (0.1 if 400 <= k < 402 else 0.0)  # a jump
         force = self._random.normal(0.0, 8.0, 6)
         lost = "unplugged" if 1000 <= k < 1050 else ""
         return RobotState(
-            timestamp=t, received=time.monotonic(), actual_q=q, actual_qd=np.zeros(N),
+            timestamp=t, received=self._time.now, actual_q=q, actual_qd=np.zeros(N),
             target_q=target, actual_TCP_force=np.full(6, np.nan) if lost else force, payload=4.0,
             payload_cog=np.array([0.0, 0.0, 0.06]), sensor_lost=lost,
         )  # fmt: skip

@@ -63,9 +63,9 @@ until(lambda: apart(r.getActualTCPPose(), pose) < 1e-6)
 out["reached"] = [a - b for a, b in zip(r.getActualTCPPose(), pose)]
 out["to_pose"] = c.moveJ_IK(start, 1.0, 2.0) and near(goal)
 out["fk_line"] = c.moveL_FK(q, 0.5, 1.2) and near(q)
-out["asynchronous"] = c.moveJ(goal, 0.3, 1.0, True)
+out["asynchronous"] = c.moveJ(goal, 0.05, 1.0, True)
 out["running"] = c.getAsyncOperationProgress()
-until(lambda: r.getActualQ()[0] < goal[0] - 0.02)
+until(lambda: r.getActualQ()[0] > q[0] + 0.01)
 c.stopJ(4.0)
 out["halfway"] = r.getActualQ()[0] - q[0]
 until(lambda: c.getAsyncOperationProgress() < 0)
