@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from clock_by_hand import ByHand
 
 from gapbridge.bridge.cell.sections import LimitSettings, SetpointSettings
 from gapbridge.bridge.ipc.loop_state import State
@@ -39,11 +39,11 @@ from gapbridge.core.errors import (
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.driver import Driver
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
 T = 0.002
+CLOCK = ByHand()
 MODEL = Model(builtin_arm("ur10e")).with_compliance([1e-6] * 6, [1e-6] * 6)
 
 
@@ -51,7 +51,7 @@ class Failing(Driver):
     """A driver whose writes fail as they are asked to; no wire fails so exactly."""
 
     def __init__(self) -> None:
-        super().__init__(500.0, MODEL)
+        super().__init__(500.0, MODEL, clock=CLOCK)
         self.error: LinkError | None = None
         self.lapsed = False
         self.sent: list[np.ndarray] = []
@@ -106,10 +106,10 @@ class Bench:
         self.changes: list[tuple[str, str]] = []  # cause and detail
         self.supervisor = Supervisor(lambda *change: self.changes.append(change[2:]))
         self.supervisor.state = State.ARMED
-        self.stream = Stream(MODEL, LimitSettings(), 500.0, clock=SYSTEM)
+        self.stream = Stream(MODEL, LimitSettings(), 500.0, clock=CLOCK)
         self.loads = LiveLoads(6, True, 0.0)
         settings = SetpointSettings()
-        source = make_source(settings, 6, True, Path(), clock=SYSTEM)
+        source = make_source(settings, 6, True, Path(), clock=CLOCK)
         reports = Reports(memory, lambda _: None)
         self.writing = Writing(settings, self.driver, source, self.stream, self.supervisor, reports)
         self.at, self.q = 1.0, Q
@@ -141,7 +141,7 @@ class Bench:
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    memory = SharedMemory(6, clock=SYSTEM)
+    memory = SharedMemory(6, clock=CLOCK)
     yield Bench(memory)
     memory.close()
 
@@ -189,7 +189,7 @@ def test_nothing_leaves_that_is_made_of_an_old_state_and_the_next_step_is_no_lar
     bench.cycles(50)
     sent, offset = len(bench.driver.sent), bench.stream.limiter.offset_in_base
     state = bench.state()
-    for expiry in (-np.inf, time.monotonic() - 1e-6):
+    for expiry in (-np.inf, CLOCK.monotonic() - 1e-6):
         assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
     assert len(bench.driver.sent) == sent
     assert (bench.stream.limiter.offset_in_base == offset).all()
@@ -199,9 +199,9 @@ def test_nothing_leaves_that_is_made_of_an_old_state_and_the_next_step_is_no_lar
 
 
 def test_what_takes_the_watchdog_too_long_to_notice_lets_nothing_old_leave(bench: Bench) -> None:
-    bench.driver.keep_alive = lambda: time.sleep(0.03)  # type: ignore[method-assign]
+    bench.driver.keep_alive = lambda: CLOCK.sleep(0.03)  # type: ignore[method-assign]
     state = bench.state()
-    expiry = time.monotonic() + 0.02
+    expiry = CLOCK.monotonic() + 0.02
     assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
     assert not bench.driver.sent
     assert bench.count("late") == 1
@@ -211,14 +211,14 @@ def test_nothing_leaves_while_a_setpoint_is_unanswered_for_longer_than_a_state_m
     bench: Bench,
 ) -> None:
     """500 Hz: 40 ms. A sample that does not know of that setpoint was taken before it came."""
-    since = time.monotonic()
+    since = CLOCK.monotonic()
     bench.driver.unanswered_since = lambda: since - 0.041  # type: ignore[method-assign]
     state = bench.state()
     assert bench.writing.write(state, Q, bench.loads.update(state)) is None
     assert not bench.driver.sent
     assert bench.count("late") == 1
     assert bench.supervisor.state == State.COMPENSATING  # the driver says when it is too long
-    bench.driver.unanswered_since = lambda: time.monotonic() - 0.02  # type: ignore[method-assign]
+    bench.driver.unanswered_since = lambda: CLOCK.monotonic() - 0.02  # type: ignore[method-assign]
     bench.cycles(1)
     assert len(bench.driver.sent) == 1
 
@@ -229,12 +229,12 @@ def test_a_process_that_was_stopped_after_the_judgement_sends_nothing_old(bench:
 
     def stopped_after(*given: Any) -> Any:
         found = limit(*given)
-        time.sleep(0.03)
+        CLOCK.sleep(0.03)
         return found
 
     bench.stream.limiter.limit = stopped_after  # type: ignore[method-assign]
     state = bench.state()
-    expiry = time.monotonic() + 0.02
+    expiry = CLOCK.monotonic() + 0.02
     assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
     assert bench.writing.unsent is not None
     assert len(bench.driver.sent) == sent
@@ -248,9 +248,9 @@ def test_a_process_that_was_stopped_after_the_judgement_sends_nothing_old(bench:
 def test_a_process_that_was_stopped_while_it_sent_reports_so_and_ends_the_motion(
     bench: Bench,
 ) -> None:
-    bench.driver._send = lambda _: time.sleep(0.03)  # type: ignore[method-assign]
+    bench.driver._send = lambda _: CLOCK.sleep(0.03)  # type: ignore[method-assign]
     state = bench.state()
-    expiry = time.monotonic() + 0.02
+    expiry = CLOCK.monotonic() + 0.02
     assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is not None
     assert bench.supervisor.state == State.HOLDING
     assert bench.count("overrun") == 1
@@ -290,9 +290,9 @@ def test_a_setpoint_that_waits_for_a_busy_robot_is_neither_sent_nor_in_force(ben
 
 def _is_late(bench: Bench) -> None:
     limit = bench.stream.limiter.limit
-    bench.stream.limiter.limit = lambda *given: (limit(*given), time.sleep(0.03))[0]  # type: ignore[method-assign]
+    bench.stream.limiter.limit = lambda *given: (limit(*given), CLOCK.sleep(0.03))[0]  # type: ignore[method-assign]
     state = bench.state()
-    bench.writing.write(state, Q, bench.loads.update(state), time.monotonic() + 0.02)
+    bench.writing.write(state, Q, bench.loads.update(state), CLOCK.monotonic() + 0.02)
     bench.stream.limiter.limit = limit  # type: ignore[method-assign]
 
 
@@ -515,7 +515,7 @@ def test_a_clock_that_goes_back_withdraws_the_offset_step_by_step(bench: Bench) 
     assert np.linalg.norm(offset[0]) > 1e-4
     bench.supervisor.take(Cause.IMPLAUSIBLE)  # what the watch over states makes of it
     bench.at -= 5.0
-    bench.driver.gate.set_clock(time.monotonic)
+    bench.driver.gate.set_clock(CLOCK.monotonic)
     for _ in range(700):
         bench.cycles(1)
         offset.append(bench.stream.limiter.offset_in_base)
