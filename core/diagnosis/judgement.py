@@ -256,15 +256,16 @@ def _insignificant(selection: Selection) -> dict[int, Withdrawal]:
 
 
 def significant_alone(
-    selection: Selection, judgement: Judgement, arm: Arm
+    selection: Selection, judgement: Judgement, held_out: HeldOut, arm: Arm
 ) -> tuple[Selection, Judgement]:
     """Return selection and judgement after the accused terms are refitted alone.
 
     With unnamed functions, and with covariances over the regions of the log, a value may be less
     significant than before, and a stiffness curve linear. If all links are accused as a whole, at
     least one of their terms must be significant, and no parameter implausible without being so.
+    What gained held out beside terms that are withdrawn here must gain without them.
     """
-    start = selection.terms
+    start, complete = selection.terms, judgement.accused
     while True:
         refit = refitted_alone(selection, arm, judgement.accused, judgement.unnamed_part, start)
         if implausible := refit.implausible_parameters(judgement.accused):
@@ -279,11 +280,18 @@ def significant_alone(
             refit.judged_together(judgement.accused),
             key=lambda kind: max(significance[p] for p in kind), default=(),
         )  # fmt: skip
-        if not weakest or max(significance[p] for p in weakest) >= 1:
-            return refit, judgement
-        inside = refit.term_index[weakest[0]] in refit.block
-        # friction that belongs to the links may be significant on more rows
-        reason = NOT_SIGNIFICANT if inside else NOT_STABLE
+        if weakest and max(significance[p] for p in weakest) < 1:
+            inside = refit.term_index[weakest[0]] in refit.block
+            # friction that belongs to the links may be significant on more rows
+            reason = NOT_SIGNIFICANT if inside else NOT_STABLE
+        else:
+            accused = [refit.term_index[p] for p in judgement.accused]
+            again = judgement.accused != complete
+            gainless = without_gain(refit, accused, held_out) if again else ()
+            weakest = tuple(p for p in judgement.accused if refit.term_index[p] in gainless)
+            if not weakest:
+                return refit, judgement
+            reason = Withdrawal(Check.HELD_OUT_GAIN)
         judgement = replace(
             judgement, accused=tuple(p for p in judgement.accused if p not in weakest),
             withdrawn=(*judgement.withdrawn, *((p, reason) for p in weakest)),

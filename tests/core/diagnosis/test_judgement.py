@@ -39,6 +39,9 @@ from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
 from gapbridge.core.metrology import Metrology
 
 LOGS = ("none", "backlash", "tool_frame", "cross_coupling", "thermal_drift")
+GAINING = SimpleNamespace(
+    possible=True, shrink=lambda *_: SimpleNamespace(interval=(0.1, 0.2))
+)  # what is held out confirms everything
 
 
 def channel_of(effect: str):
@@ -288,14 +291,16 @@ def test_all_links_are_accused_only_if_one_of_them_is_significant(monkeypatch, t
         prior=dict.fromkeys((8, 9), np.full(3, 5e-4)), block=(8, 9),
         is_link=lambda p: p > 0, _in_geometry=lambda p: p > 0,
         observation=SimpleNamespace(channel="position"),
-        space=SimpleNamespace(candidates={7: SimpleNamespace(effect=effect_named("joint_offset"))}),
+        space=SimpleNamespace(candidates={
+            7: SimpleNamespace(effect=effect_named("joint_offset"), family="joint_offset")
+        }),
     )  # fmt: skip
     found.judged_together = partial(Selection.judged_together, found)
     found.implausible_parameters = partial(Selection.implausible_parameters, found)
     found.covariance[0] = found.covariance[0] * 1e-4
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
     given = Judgement((0, 1, 2), False, None, (), {}, ())
-    selection, judgement = significant_alone(found, given, None)
+    selection, judgement = significant_alone(found, given, GAINING, None)
     assert selection is found
     assert judgement.accused == stays
     assert {p for p, _ in judgement.withdrawn} == {0, 1, 2} - {*stays}
@@ -348,8 +353,38 @@ def test_each_joint_zero_of_the_links_has_to_be_significant(monkeypatch, offset,
     for name in ("_in_geometry", "is_link", "judged_together", "implausible_parameters"):
         setattr(found, name, partial(getattr(Selection, name), found))
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
-    _, judgement = significant_alone(found, Judgement((0, 1, 2), False, None, (), {}, ()), None)
+    _, judgement = significant_alone(
+        found, Judgement((0, 1, 2), False, None, (), {}, ()), GAINING, None
+    )
     assert judgement.accused == stays
+
+
+@pytest.mark.parametrize(
+    ("first_sigma", "low", "stays"),
+    [(1.0, -0.06, ()), (1.0, 0.1, (1,)), (1e-5, -0.06, (0, 1))],
+)
+def test_what_gains_beside_a_withdrawn_term_only_is_withdrawn_too(
+    monkeypatch, first_sigma, low, stays
+):
+    """A UR5 of 20 poses: base_compliance beside a link that is not significant. Nothing is judged
+    twice where nothing was withdrawn."""
+    terms = tuple(Term("joint_offset", Site(j), (1e-3,)) for j in (1, 2))
+    own = SimpleNamespace(effect=effect_named("joint_offset"), family="joint_offset")
+    found = SimpleNamespace(
+        terms=terms, covariance=[np.eye(1) * first_sigma**2, np.eye(1) * 1e-10], term_index=(0, 1),
+        block=(), observation=SimpleNamespace(channel="position"),
+        space=SimpleNamespace(candidates=[own, own]), judged_together=lambda a: [(p,) for p in a],
+        implausible_parameters=lambda _: {},
+    )  # fmt: skip
+    monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
+    held_out = SimpleNamespace(
+        possible=True, shrink=lambda *_: SimpleNamespace(interval=(low, 0.4))
+    )
+    given = Judgement((0, 1), False, None, (), {}, ())
+    _, judgement = significant_alone(found, given, held_out, None)
+    assert judgement.accused == stays
+    reasons = {p: why.failed for p, why in judgement.withdrawn}
+    assert reasons.get(1) == (None if 1 in stays else Check.HELD_OUT_GAIN)
 
 
 @pytest.mark.parametrize(("spread", "held"), [(9e-3, True), (5e-3, False)])
@@ -377,7 +412,9 @@ def test_a_twist_far_outside_the_prior_has_to_be_significant(monkeypatch, spread
 
     found.with_nominal = with_nominal
     monkeypatch.setattr(judging, "refitted_alone", lambda selection, *_: selection)
-    selection, judgement = significant_alone(found, Judgement((0,), False, None, (), {}, ()), None)
+    selection, judgement = significant_alone(
+        found, Judgement((0,), False, None, (), {}, ()), GAINING, None
+    )
     assert selection is (again if held else found)
     assert requested == ([{4: [False, False, True]}] if held else [])
     assert judgement.accused == (0,)
