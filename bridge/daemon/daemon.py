@@ -317,7 +317,7 @@ class Daemon:
         # after a crash --arm from a terminal may arm, a restarted service may not
         if arm and lock.disorder and (by != "--arm" or self.manager.present):
             detail = f"{lock.disorder}: not arming by itself; gapbridge arm"
-            self.event_log.add({"kind": EventKind.REFUSED, "detail": detail})
+            self.event_log.add({"kind": EventKind.REFUSED, "what": "arm", "detail": detail})
             return False
         return arm
 

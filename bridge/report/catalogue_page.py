@@ -50,7 +50,7 @@ def _place(effect: Effect) -> str:
 
 def _effect(effect: Effect) -> str:
     lines = [f"### {effect.identifier}", "", inspect.getdoc(effect) or "", ""]
-    lines.append(f"- shows in: {', '.join(effect.channels)}; sits at: {_place(effect)}")
+    lines.append(f"- shows in: {', '.join(effect.channels)}; acts at: {_place(effect)}")
     if effect.motion:
         lines.append(f"- the log must hold: {effect.motion}")
     for other, data in ties_of(effect.identifier).items():

@@ -50,7 +50,7 @@ def played(command: Array, width: float, first: float) -> Array:
     """Return the output (N,) of play of half width ``width`` for a command, starting at ``first``.
 
     It is constant while the command is within the width, and follows at either end of it.
-    A negative width, which only steps of a solver ask for, is continued oddly.
+    A negative width, which only steps of a solver ask for, gives the odd continuation.
     """
     result = _pushed(np.ascontiguousarray(command), abs(width), first)
     return np.asarray(result if width >= 0 else 2 * command - result)

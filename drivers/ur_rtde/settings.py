@@ -42,7 +42,7 @@ class UrRtdeSettings(DriverSettings):
     )  # fmt: skip
     tcp_tolerance: float = Field(
         0.005, gt=0.0, le=0.05,
-        description="offset: m that the controller's TCP may be from the cell's, while armed",
+        description="m that the controller's TCP may be from the cell's; offset: while armed too",
     )  # fmt: skip
     remote_control: bool = Field(
         True, description="servoj: refuse where the robot is not in remote control"

@@ -45,7 +45,7 @@ def explanation_text(effect: Effect) -> str:
         lines.append(f"looks the same as {other} on: {data}")
     if effect.needs:
         lines.append(f"needs columns: {', '.join(effect.needs)}")
-    lines.append("sits at: " + ("one joint each" if sites[0].joint else "the whole arm"))
+    lines.append("acts at: " + ("one joint each" if sites[0].joint else "the whole arm"))
     lines.append("parameters in a cell file:")
     lines += [f"  {name} ({unit})" for name, unit in parameter_texts(effect)]
     return "\n".join(lines)

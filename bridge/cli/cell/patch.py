@@ -21,7 +21,9 @@ from gapbridge.core.errors import InputError
 @cell_option
 @click.option("--out", required=True, type=FILE, help="The patched model to write.")
 @click.option("--joints", metavar="A,B,...", help="The model's joints, in the order of the arm's.")
-@click.option("--tcp", metavar="NAME", help="The model's TCP: a site (MJCF) or a link (URDF).")
+@click.option(
+    "--tcp", metavar="NAME", help="The model's TCP: a site (MJCF), link (URDF) or Xform (USD)."
+)
 @click.option("--load", metavar="NAME", help="An MJCF's body that is the declared payload.")
 @click.option(
     "--parameters",

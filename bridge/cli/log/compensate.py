@@ -51,7 +51,8 @@ def compensate(log: Path, cell: Path, out: Path) -> None:
     Setpoints are taken from target_q (if missing, from actual_q). The intended pose is that of the
     rigid arm without effects at the setpoint; the corrected setpoint is the one whose predicted
     real pose equals it. Writes corrected_q_0..n-1 (rad). A row whose correction exceeds
-    limits.offset or limits.offset_rotation of the cell is refused; nothing is written then.
+    limits.offset, offset_rotation or joint_offset of the cell, or that misses its intended pose by
+    more than limits.offset, is refused; nothing is written then.
 
     Example: gapbridge compensate log.csv --cell cell.yaml --out corrected.csv
     """

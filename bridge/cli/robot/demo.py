@@ -43,6 +43,7 @@ def demo(seed: int, out: Path, link: str) -> None:  # fmt: skip
     cause that the simulated arm does not have.
 
     Example: gapbridge demo --seed 3
+
     Example: gapbridge demo --link can --out out/demo_can
     """
     require_folder(out, "--out")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class JointOffset(JointEffect):
-    """The encoder's zero stands elsewhere than the model's: true angle = ``actual_q`` + offset.
+    """The encoder's zero differs from the model's: true angle = ``actual_q`` + offset.
 
     Comes from mastering, a changed motor, a collision. Shows as a rotation of everything beyond the
     joint about its axis, the same at every pose and load. Joint 1 hides behind an unregistered

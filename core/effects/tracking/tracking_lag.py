@@ -18,7 +18,7 @@ class TrackingLag(ServoEffect):
     Comes from the servo's bandwidth. Steady motion runs T qd behind; corners are rounded off,
     which is what separates it from pure latency. Exact: the lag's response to the command, which
     runs from row to row as a ramp (finer than the log where that is coarse), from where the
-    encoder stood at first. A negative T, which only steps of a solver ask for, is continued oddly.
+    encoder stood at first. A negative T occurs in a solver's steps only: the odd continuation.
     Source: Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
     """
 
