@@ -18,9 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from gapbridge.drivers.clock import Clock
+
 LONGEST_REQUEST = 4096  # bytes
 REQUEST_TIMEOUT = 5.0  # s until a request must arrive
 MAX_CONNECTIONS = 8
+RETRY = 0.05  # s after a connection that could not be accepted: descriptors or memory ran out
 COMMANDS = ("status", "arm", "disarm")
 _CREDENTIALS = struct.Struct("3i")
 
@@ -39,10 +42,11 @@ Answer = Callable[[str, Peer], dict[str, Any]]
 class ControlSocket:
     """Serves a unix socket in threads of its own; ``answer`` is called in them."""
 
-    def __init__(self, path: Path, answer: Answer) -> None:
+    def __init__(self, path: Path, answer: Answer, clock: Clock) -> None:
         self.path = path
-        self._answer = answer
+        self._answer, self._clock = answer, clock
         self._listener: socket.socket | None = None
+        self._closed = threading.Event()
         self._slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
 
     def open(self) -> None:
@@ -62,11 +66,13 @@ class ControlSocket:
             listener.close()
             raise
         self._listener = listener
+        self._closed.clear()
         threading.Thread(target=self._serve, args=(listener,), daemon=True).start()
 
     def close(self) -> None:
         """Stop listening and remove the socket; may be repeated."""
         listener, self._listener = self._listener, None
+        self._closed.set()
         if listener is not None:
             with contextlib.suppress(OSError):
                 listener.shutdown(socket.SHUT_RDWR)
@@ -75,15 +81,20 @@ class ControlSocket:
                 self.path.unlink()
 
     def _serve(self, listener: socket.socket) -> None:
-        while True:
+        while self._listener is listener:
             try:
                 connection, _ = listener.accept()
-            except OSError:
-                return
+            except OSError:  # without this socket nobody can disarm: only close() ends it
+                self._clock.wait(self._closed, RETRY)
+                continue
             if not self._slots.acquire(blocking=False):
                 connection.close()
                 continue
-            threading.Thread(target=self._handle, args=(connection,), daemon=True).start()
+            try:
+                threading.Thread(target=self._handle, args=(connection,), daemon=True).start()
+            except (RuntimeError, MemoryError):
+                connection.close()
+                self._slots.release()
 
     def _handle(self, connection: socket.socket) -> None:
         try:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
 import socket
 import stat
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -48,7 +51,7 @@ def served(tmp_path: Path) -> Iterator[tuple[Path, list[tuple[str, Peer]]]]:
         return {"ok": True, "answer": command}
 
     path = tmp_path / "x.sock"
-    with ControlSocket(path, answer):
+    with ControlSocket(path, answer, SYSTEM):
         yield path, asked
 
 
@@ -118,6 +121,46 @@ def test_nonsense_is_refused_in_one_line(served: tuple[Path, list[Any]], data: b
     assert "expected" in reply["error"]
     assert asked == []
     assert ask_socket(path, "status") == "status"
+
+
+class OutOfDescriptors(socket.socket):
+    """A listener whose first connections cannot be accepted."""
+
+    left = 3
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        if self.left:
+            self.left -= 1
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        return super().accept()
+
+
+def test_a_connection_that_cannot_be_accepted_does_not_end_the_socket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x.sock"
+    control = ControlSocket(path, lambda command, _: {"ok": True, "answer": command}, SYSTEM)
+    with monkeypatch.context() as patched:
+        patched.setattr(control_socket.socket, "socket", OutOfDescriptors)
+        control.open()
+    with contextlib.closing(control):
+        assert ask_socket(path, "disarm") == "disarm"
+
+
+def test_a_thread_that_cannot_be_started_does_not_end_the_socket(
+    served: tuple[Path, list[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, _ = served
+
+    def fail(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", fail)
+        for _ in range(2 * control_socket.MAX_CONNECTIONS):
+            with pytest.raises((RunError, OSError)):
+                ask_socket(path, "status")
+    assert ask_socket(path, "disarm") == "disarm"
 
 
 def test_a_folder_of_somebody_else_is_not_used(
