@@ -116,8 +116,12 @@ class DriverWithSensor(Driver):
         return self._arm.mismatch()
 
     def _send(self, setpoint: Setpoint) -> None:
-        """Send one setpoint to the arm."""
-        self._arm.write_setpoint(setpoint, self._expiry)
+        """Send one setpoint to the arm: not by its write_setpoint, which has the same gate."""
+        self._arm._send_for(self, setpoint)
+
+    def _take_lapsed(self) -> bool:
+        """See Driver.take_lapsed."""
+        return self._arm._take_lapsed()
 
     def close(self) -> None:
         """Close both links."""
@@ -133,15 +137,15 @@ class DriverWithSensor(Driver):
                 f"found no sample of the sensor within {self.settings.connect_timeout:g} s of "
                 "arming (ft_sensor.connect_timeout)"
             )
-        self._arm.arm(state)
+        self._arm._make_ready(state)
 
     def _release(self) -> None:
         """Stop writing to the arm."""
-        self._arm.release()
+        self._arm._release()
 
     def _abandon(self) -> None:
         """Stop writing to the arm in a fault."""
-        self._arm.abandon()
+        self._arm._abandon()
 
     def nominal_q(self, state: RobotState) -> Array:
         """See Driver.nominal_q."""

@@ -365,3 +365,35 @@ def test_setpoints_and_the_arms_own_wishes_pass_through() -> None:
         assert np.array_equal(driver.nominal_q(state), state.target_q)
         assert (driver.rate, driver.n, driver.moves_arm) == (500.0, 6, True)
         driver.release()
+
+
+class LapsingDriver(ControllerDriver):
+    """An arm whose setpoints may become too old, as those that wait for a SYNC do."""
+
+    lapsed = False
+
+    def _take_lapsed(self) -> bool:
+        lapsed, self.lapsed = self.lapsed, False
+        return lapsed
+
+
+def test_a_setpoint_of_the_arm_that_lapsed_is_taken_back_once() -> None:
+    controller = resting_controller(TURNED)
+    wire, arm = make_wire("robotous_rft", reaction_of(controller)), LapsingDriver(controller)
+    with wire.device, DriverWithSensor(arm, wire.settings(**MOUNTED), model()) as driver:
+        state = driver.read_state()
+        driver.arm(state)
+        q = state.target_q
+        for way in (0.0, 0.001):
+            driver.write_setpoint(Setpoint(q + way, q, np.zeros(6)), expiry=7.0)
+        assert len(arm.written) == 2
+        assert arm._expiry == 7.0
+        assert not driver.take_lapsed()
+        assert driver.gate._joints[2] == pytest.approx(q + 0.001, abs=1e-12)
+        arm.lapsed = True
+        assert driver.take_lapsed()
+        assert driver.gate._joints[2] == pytest.approx(q, abs=1e-12), "as before the lapsed one"
+        assert not driver.take_lapsed(), "once"
+        driver.release()
+        with pytest.raises(WriteError, match=r"arm\(\) first"):
+            driver.write_setpoint(Setpoint(q, q, np.zeros(6)))
