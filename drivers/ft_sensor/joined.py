@@ -12,7 +12,7 @@ from collections import deque
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.effects import CATALOGUE, acting
+from gapbridge.core.effects import CATALOGUE, acting, correcting
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.loads import Loads
@@ -167,8 +167,9 @@ def sensor_to_flange(frame: SensorFrame) -> Array:
 class TcpForce:
     """Derives ``actual_TCP_force`` from the flange sensor, as controllers do from their own.
 
-    The declared payload's weight is subtracted (not its inertia: the result holds for slow motion),
-    and the sensor errors in the model are corrected. Deflection is neglected.
+    The payload's weight is subtracted, the declared one and what the model's effects add to it (not
+    its inertia: the result holds for slow motion), and the sensor errors in the model are
+    corrected. Deflection is neglected.
     """
 
     def __init__(self, model: Model) -> None:
@@ -178,6 +179,8 @@ class TcpForce:
         # prepared once: Model.predict would do it in every cycle
         rigid = model.without_terms()
         self._chain, self._rows = rigid.chain(), rigid.rows(np.zeros((1, model.arm.n)))
+        self._undeclared = [t for t in model.terms if t.effect in correcting("payload")]
+        self._no_loads = Loads()
         self._place = np.empty((1, 3)), np.empty((1, 3, 3))
         self._flange_in_base()  # loads compiled code before the first cycle
 
@@ -185,12 +188,14 @@ class TcpForce:
         """Return force and torque (6,) of the surroundings on the tool, at the TCP, base axes.
 
         ``wrench_in_flange`` is the sensor's wrench (6,), flange axes, about the flange origin. The
-        payload is the one that the controller declares, else the model's.
+        declared payload is the controller's, else the model's.
         """
-        model = self._model
-        mass = model.payload_mass if state.payload is None else state.payload
-        cog = model.payload_cog if state.payload_cog is None else state.payload_cog
-        self._rows.q[0] = state.actual_q
+        model, rows = self._model, self._rows
+        rows.q[0] = state.actual_q
+        rows.payload_mass[0] = model.payload_mass if state.payload is None else state.payload
+        rows.payload_cog[0] = model.payload_cog if state.payload_cog is None else state.payload_cog
+        model.condition(rows, self._no_loads, rows.q, self._undeclared)
+        mass, cog = rows.payload_mass[0], rows.payload_cog[0]
         flange_in_base = self._flange_in_base()
         weight = flange_in_base.T @ (mass * model.gravity)
         wrench = self._undo @ (wrench_in_flange - self._bias)

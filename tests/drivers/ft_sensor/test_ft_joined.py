@@ -166,6 +166,20 @@ def test_the_controllers_declared_payload_stands_instead_of_the_models() -> None
         assert np.all(np.abs(driver.read_state().actual_TCP_force) <= bounds("robotous_rft"))
 
 
+def test_a_load_in_the_effects_weighs_on_the_sensor_and_is_no_external_force() -> None:
+    controller = resting_controller(TURNED)
+    wire = make_wire("robotous_rft", reaction_of(controller))
+    shift = (0.03, 0.01, -0.02)
+    undeclared = model(
+        payload_mass=MASS - 1.0,
+        payload_cog=np.array(COG) - shift,
+        terms=(Term("payload", Site(), (1.0,)), Term("payload_cog", Site(), shift)),
+    )
+    with wire.device, joined(wire, controller, undeclared) as driver:
+        for _ in range(3):  # each cycle begins with what is declared
+            assert np.all(np.abs(driver.read_state().actual_TCP_force) <= bounds("robotous_rft"))
+
+
 def test_an_arm_may_keep_its_own_tcp_force() -> None:
     controller = resting_controller(TURNED)
     wire = make_wire("robotous_rft", reaction_of(controller))
