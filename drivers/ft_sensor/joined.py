@@ -13,7 +13,13 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects import CATALOGUE, acting, correcting
-from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from gapbridge.core.errors import (
+    InvalidStateError,
+    LinkError,
+    StaleStateError,
+    WriteError,
+    first_line,
+)
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
@@ -246,7 +252,11 @@ class SensorReader:
         """Connect and wait for the first sample. Raises LinkError."""
         self._stopping.clear()
         self._readings.clear()
-        self._sensor.connect()
+        try:
+            self._sensor.connect()
+        except Exception as error:  # as in _run
+            self._sensor.close()
+            raise LinkError(self._report(error)) from error
         self._new_sample.clear()  # before the thread: its first sample may be the only one for now
         self._thread = self._begin_thread()
         if not self._clock.wait(self._new_sample, self._settings.connect_timeout):
@@ -273,6 +283,12 @@ class SensorReader:
             return f" ({self._broken})"
         return f" ({dropped} pieces of garbage dropped)" if dropped else ""
 
+    def _report(self, error: Exception) -> str:
+        """Return an error of the link as text with the sensor's name."""
+        if isinstance(error, LinkError):
+            return str(error)
+        return f"{self._sensor.name}: {type(error).__name__}: {first_line(error)}"
+
     def _run(self) -> None:
         pause = BACKOFF[0]
         while not self._stopping.is_set():
@@ -281,9 +297,9 @@ class SensorReader:
                     self._sensor.connect()
                     self._broken = ""
                 reading = self._sensor.read(LISTEN)
-            except LinkError as error:
+            except Exception as error:  # adapters and their libraries raise what they like
                 self._sensor.close()
-                self._broken = str(error)
+                self._broken = self._report(error)
                 self._clock.wait(self._stopping, pause)
                 pause = min(2.0 * pause, BACKOFF[1])
                 continue

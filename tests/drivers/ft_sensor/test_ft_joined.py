@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import termios
 import threading
 import time
 from collections import deque
@@ -101,6 +102,31 @@ class ListedSensor(ForceTorqueSensor):
 
     def close(self) -> None:
         pass
+
+
+class BreakingSensor(ListedSensor):
+    """Its link breaks with any error after the first sample, and works again once mended."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__([Reading(0.0, 0.0, np.zeros(6))])
+        self.error, self.opened, self.closed = error, 0, 0
+        self.mended = threading.Event()
+
+    def connect(self) -> None:
+        self.opened += 1
+        if self.opened > 1:
+            assert self.mended.wait(PATIENCE)
+
+    def read(self, timeout: float) -> Reading | None:
+        if self.opened > 1:
+            self.left.append(Reading(0.0, 0.0, np.ones(6)))
+            time.sleep(0.001)
+        if not self.left:
+            raise self.error
+        return super().read(timeout)
+
+    def close(self) -> None:
+        self.closed += 1
 
 
 def model(**changed: Any) -> Model:
@@ -272,6 +298,43 @@ def test_a_cut_serial_line_is_reported_and_opened_anew(tmp_path: Any) -> None:
             read_for(driver, PATIENCE)
         device.start()
         heal(driver)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [IndexError("index out of range"), RuntimeError(), termios.error(5, "Input/output error")],
+)
+def test_any_error_of_a_sensors_link_is_reported_and_the_link_opened_anew(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sensor = BreakingSensor(error)
+    monkeypatch.setattr(joined_module, "make_sensor", lambda *_: sensor)
+    settings = settings_of(driver="ati_netcanoem", interface="virtual", channel="none")
+    arm = ControllerDriver(resting_controller(TURNED), clock=Standing())
+    with DriverWithSensor(arm, settings, model()) as driver:
+        reader = driver._reader
+        wait_for(lambda: sensor.opened == 2, "a second attempt")
+        assert sensor.closed == 1
+        assert type(error).__name__ in reader._why()
+        sensor.mended.set()
+        wait_for(lambda: bool(reader.at(0.0).wrench[0] == 1.0), "samples of the mended link")
+        assert reader._why() == ""
+
+
+def test_any_error_of_the_first_connection_is_a_link_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sensor = ListedSensor([])
+
+    def fail() -> None:
+        raise IndexError("index out of range")
+
+    monkeypatch.setattr(sensor, "connect", fail)
+    monkeypatch.setattr(joined_module, "make_sensor", lambda *_: sensor)
+    settings = settings_of(driver="ati_netcanoem", interface="virtual", channel="none")
+    driver = DriverWithSensor(ControllerDriver(resting_controller(TURNED)), settings, model())
+    with pytest.raises(LinkError, match="force-torque sensor: IndexError: index out of range"):
+        driver.connect()
 
 
 @pytest.mark.parametrize(
