@@ -127,10 +127,12 @@ class ControlSocket:
         try:
             request = json.loads(line)
             command = request["command"]
-        except (ValueError, TypeError, KeyError):
+        except (ValueError, TypeError, KeyError, RecursionError):
+            command = None
+        if not isinstance(command, str):  # nor is it shown: a nested one may be too deep for that
             return refusal('found no request, expected {"command": ...} as one line of JSON')
         if command not in COMMANDS:
-            return refusal(f"found command {str(command)[:40]!r}, expected {', '.join(COMMANDS)}")
+            return refusal(f"found command {command[:40]!r}, expected {', '.join(COMMANDS)}")
         slots = self._disarm_slots if command == "disarm" else self._slots
         if not slots.acquire(blocking=False):
             return refusal(f"found {MAX_REQUESTS} requests that are not answered yet, try again")

@@ -164,6 +164,17 @@ def test_a_thread_that_cannot_be_started_does_not_end_the_socket(
     assert ask_socket(path, "disarm") == "disarm"
 
 
+@pytest.mark.parametrize("lists", [b"[" * 4000, b"[" * 900 + b"]" * 900, b"[" * 400 + b"]" * 400])
+@pytest.mark.parametrize("start", [b"", b'{"command": '])
+def test_what_is_nested_too_deep_is_refused(
+    served: tuple[Path, list[Any]], start: bytes, lists: bytes
+) -> None:
+    path, asked = served
+    reply = talk(path, (start + lists + b"}")[: control_socket.LONGEST_REQUEST - 1] + b"\n")
+    assert "found no request" in reply["error"]
+    assert asked == []
+
+
 def test_connections_that_say_nothing_keep_no_request_out(
     served: tuple[Path, list[Any]],
 ) -> None:
