@@ -324,6 +324,7 @@ class SensorReader:
                 break
             if earlier.timestamp <= moment:
                 self._require_valid(earlier)
+                self._require_valid(later)
                 return _between(earlier, later, moment)
             later = earlier
         self._require_valid(later)

@@ -352,6 +352,23 @@ def test_more_than_the_sensor_may_carry_is_not_believed(
         driver.read_state()
 
 
+def test_a_wrench_between_two_samples_is_believed_only_if_both_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    samples = [Reading(0.01 * k, 0.01 * k, np.zeros(6), status=int(k == 2)) for k in range(5)]
+    sensor = ListedSensor(samples)
+    monkeypatch.setattr(joined_module, "make_sensor", lambda *_: sensor)
+    settings = settings_of(driver="ati_netcanoem", interface="virtual", channel="none")
+    arm = ControllerDriver(resting_controller(TURNED), clock=Standing())
+    with DriverWithSensor(arm, settings, model()) as driver:
+        assert sensor.emptied.wait(PATIENCE)
+        for moment in (0.015, 0.025):
+            with pytest.raises(InvalidStateError):
+                driver._reader.at(moment)
+        for moment in (0.005, 0.035):
+            assert np.all(driver._reader.at(moment).wrench == 0.0)
+
+
 def test_the_sensors_own_overload_bits_are_not_believed_and_pass() -> None:
     controller = resting_controller(TURNED)
     wire = make_wire("robotous_rft", reaction_of(controller))
