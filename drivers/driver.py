@@ -122,6 +122,11 @@ class Driver(ABC):
     def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint that has passed the gate; see ``write_setpoint``."""
 
+    def _send_for(self, outer: Driver, setpoint: Setpoint) -> None:
+        """Send a setpoint that has passed the gate of ``outer``, the driver around this one."""
+        self._expiry = outer._expiry
+        self._send(setpoint)
+
     @final
     def take_lapsed(self) -> bool:
         """Return, once, whether the setpoint sent last never took effect: it had become too old.

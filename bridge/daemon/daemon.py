@@ -295,7 +295,7 @@ class Daemon:
         stack.callback(self._zeros.close)
         path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
         try:
-            stack.enter_context(ControlSocket(path, self.control.answer))
+            stack.enter_context(ControlSocket(path, self.control.answer, self._clock))
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}, expected a socket to listen on") from None
         if settings.web is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gapbridge.bridge.cell.runtime_folder import candidates, cell_key
-from gapbridge.core.errors import InputError, RunError
+from gapbridge.core.errors import InputError, RunError, first_line
 
 ANSWER_TIMEOUT = 60.0  # s: a loop may have to restart, arming uploads a program to the robot
 
@@ -17,19 +17,23 @@ ANSWER_TIMEOUT = 60.0  # s: a loop may have to restart, arming uploads a program
 def ask(cell: Path, command: str) -> Any:
     """Return a daemon's answer to a command.
 
-    Raises InputError if no daemon runs for the cell, RunError if it refuses.
+    Raises InputError if no daemon runs for the cell, RunError if it refuses or does not answer.
     """
     if not cell.exists():
         raise InputError(f"{cell}: file not found, expected a cell file (YAML)")
     name = f"{cell_key(cell)}.sock"
-    refused = ""
+    refused = silent = ""
     for folder in candidates():
         try:
             return ask_socket(folder / name, command)
         except PermissionError:
             refused = f"{folder / name}: found a daemon of another user, expected your own"
-        except OSError:
-            continue
+        except (FileNotFoundError, ConnectionRefusedError):
+            continue  # no daemon has it open
+        except OSError as error:
+            silent = f"{folder / name}: {first_line(error)}, expected an answer of the daemon"
+    if silent:
+        raise RunError(silent)
     if not refused:
         from gapbridge.bridge.cell.document import read_document  # brings yaml
 

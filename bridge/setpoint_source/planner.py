@@ -253,9 +253,8 @@ class PlannerSource(InterpolatedSource):
 
     def _take(self, connection: Connection, text: bytes) -> bool:
         try:
-            numbers = json.loads(text)["q"] if text.startswith(b"{") else text.split(b",")
-            values = [float(v) for v in numbers]
-        except (ValueError, KeyError, TypeError, RecursionError):
+            values = _numbers(text)
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             shown = text[:60].decode("utf-8", "replace")
             self._end(connection, f'found {shown!r}, expected {{"q": [...]}}')
             return False
@@ -277,3 +276,17 @@ class PlannerSource(InterpolatedSource):
     def _end(self, connection: Connection, message: str) -> None:
         self.refused += 1
         connection.refuse(message)
+
+
+def _numbers(text: bytes) -> list[float]:
+    """Return the numbers of a line.
+
+    Raises ValueError, KeyError, TypeError, OverflowError or RecursionError for another text.
+    """
+    if not text.startswith(b"{"):
+        return [float(v) for v in text.split(b",")]
+    numbers = json.loads(text)["q"]
+    # float() takes booleans too, and a text is a sequence of digits
+    if not isinstance(numbers, list) or any(type(v) not in (int, float) for v in numbers):
+        raise TypeError("found another value than a number")
+    return [float(v) for v in numbers]

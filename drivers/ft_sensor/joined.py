@@ -12,8 +12,14 @@ from collections import deque
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.effects import CATALOGUE, acting
-from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from gapbridge.core.effects import CATALOGUE, acting, correcting
+from gapbridge.core.errors import (
+    InvalidStateError,
+    LinkError,
+    StaleStateError,
+    WriteError,
+    first_line,
+)
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
@@ -116,8 +122,12 @@ class DriverWithSensor(Driver):
         return self._arm.mismatch()
 
     def _send(self, setpoint: Setpoint) -> None:
-        """Send one setpoint to the arm."""
-        self._arm.write_setpoint(setpoint, self._expiry)
+        """Send one setpoint to the arm: not by its write_setpoint, which has the same gate."""
+        self._arm._send_for(self, setpoint)
+
+    def _take_lapsed(self) -> bool:
+        """See Driver.take_lapsed."""
+        return self._arm._take_lapsed()
 
     def close(self) -> None:
         """Close both links."""
@@ -133,15 +143,15 @@ class DriverWithSensor(Driver):
                 f"found no sample of the sensor within {self.settings.connect_timeout:g} s of "
                 "arming (ft_sensor.connect_timeout)"
             )
-        self._arm.arm(state)
+        self._arm._make_ready(state)
 
     def _release(self) -> None:
         """Stop writing to the arm."""
-        self._arm.release()
+        self._arm._release()
 
     def _abandon(self) -> None:
         """Stop writing to the arm in a fault."""
-        self._arm.abandon()
+        self._arm._abandon()
 
     def nominal_q(self, state: RobotState) -> Array:
         """See Driver.nominal_q."""
@@ -163,8 +173,9 @@ def sensor_to_flange(frame: SensorFrame) -> Array:
 class TcpForce:
     """Derives ``actual_TCP_force`` from the flange sensor, as controllers do from their own.
 
-    The declared payload's weight is subtracted (not its inertia: the result holds for slow motion),
-    and the sensor errors in the model are corrected. Deflection is neglected.
+    The payload's weight is subtracted, the declared one and what the model's effects add to it (not
+    its inertia: the result holds for slow motion), and the sensor errors in the model are
+    corrected. Deflection is neglected.
     """
 
     def __init__(self, model: Model) -> None:
@@ -174,6 +185,8 @@ class TcpForce:
         # prepared once: Model.predict would do it in every cycle
         rigid = model.without_terms()
         self._chain, self._rows = rigid.chain(), rigid.rows(np.zeros((1, model.arm.n)))
+        self._undeclared = [t for t in model.terms if t.effect in correcting("payload")]
+        self._no_loads = Loads()
         self._place = np.empty((1, 3)), np.empty((1, 3, 3))
         self._flange_in_base()  # loads compiled code before the first cycle
 
@@ -181,12 +194,14 @@ class TcpForce:
         """Return force and torque (6,) of the surroundings on the tool, at the TCP, base axes.
 
         ``wrench_in_flange`` is the sensor's wrench (6,), flange axes, about the flange origin. The
-        payload is the one that the controller declares, else the model's.
+        declared payload is the controller's, else the model's.
         """
-        model = self._model
-        mass = model.payload_mass if state.payload is None else state.payload
-        cog = model.payload_cog if state.payload_cog is None else state.payload_cog
-        self._rows.q[0] = state.actual_q
+        model, rows = self._model, self._rows
+        rows.q[0] = state.actual_q
+        rows.payload_mass[0] = model.payload_mass if state.payload is None else state.payload
+        rows.payload_cog[0] = model.payload_cog if state.payload_cog is None else state.payload_cog
+        model.condition(rows, self._no_loads, rows.q, self._undeclared)
+        mass, cog = rows.payload_mass[0], rows.payload_cog[0]
         flange_in_base = self._flange_in_base()
         weight = flange_in_base.T @ (mass * model.gravity)
         wrench = self._undo @ (wrench_in_flange - self._bias)
@@ -237,7 +252,11 @@ class SensorReader:
         """Connect and wait for the first sample. Raises LinkError."""
         self._stopping.clear()
         self._readings.clear()
-        self._sensor.connect()
+        try:
+            self._sensor.connect()
+        except Exception as error:  # as in _run
+            self._sensor.close()
+            raise LinkError(self._report(error)) from error
         self._new_sample.clear()  # before the thread: its first sample may be the only one for now
         self._thread = self._begin_thread()
         if not self._clock.wait(self._new_sample, self._settings.connect_timeout):
@@ -264,6 +283,12 @@ class SensorReader:
             return f" ({self._broken})"
         return f" ({dropped} pieces of garbage dropped)" if dropped else ""
 
+    def _report(self, error: Exception) -> str:
+        """Return an error of the link as text with the sensor's name."""
+        if isinstance(error, LinkError):
+            return str(error)
+        return f"{self._sensor.name}: {type(error).__name__}: {first_line(error)}"
+
     def _run(self) -> None:
         pause = BACKOFF[0]
         while not self._stopping.is_set():
@@ -272,9 +297,9 @@ class SensorReader:
                     self._sensor.connect()
                     self._broken = ""
                 reading = self._sensor.read(LISTEN)
-            except LinkError as error:
+            except Exception as error:  # adapters and their libraries raise what they like
                 self._sensor.close()
-                self._broken = str(error)
+                self._broken = self._report(error)
                 self._clock.wait(self._stopping, pause)
                 pause = min(2.0 * pause, BACKOFF[1])
                 continue
@@ -299,6 +324,7 @@ class SensorReader:
                 break
             if earlier.timestamp <= moment:
                 self._require_valid(earlier)
+                self._require_valid(later)
                 return _between(earlier, later, moment)
             later = earlier
         self._require_valid(later)

@@ -115,7 +115,7 @@ class RobotiqFt300(ForceTorqueSensor):
             line.flush()
             self._sleep(len(QUIET) * BITS / self.settings.baudrate + TURN)
             line.reset_input_buffer()
-        except OSError as error:  # pyserial's errors are OSErrors
+        except Exception as error:  # pyserial passes on termios.error, which is no OSError
             raise self._broken(error) from None
 
     def _start_stream(self) -> None:

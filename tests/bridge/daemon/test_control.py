@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
 import socket
 import stat
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +52,7 @@ def served(tmp_path: Path) -> Iterator[tuple[Path, list[tuple[str, Peer]]]]:
         return {"ok": True, "answer": command}
 
     path = tmp_path / "x.sock"
-    with ControlSocket(path, answer):
+    with ControlSocket(path, answer, SYSTEM):
         yield path, asked
 
 
@@ -118,6 +122,118 @@ def test_nonsense_is_refused_in_one_line(served: tuple[Path, list[Any]], data: b
     assert "expected" in reply["error"]
     assert asked == []
     assert ask_socket(path, "status") == "status"
+
+
+class OutOfDescriptors(socket.socket):
+    """A listener whose first connections cannot be accepted."""
+
+    left = 3
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        if self.left:
+            self.left -= 1
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        return super().accept()
+
+
+def test_a_connection_that_cannot_be_accepted_does_not_end_the_socket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x.sock"
+    control = ControlSocket(path, lambda command, _: {"ok": True, "answer": command}, SYSTEM)
+    with monkeypatch.context() as patched:
+        patched.setattr(control_socket.socket, "socket", OutOfDescriptors)
+        control.open()
+    with contextlib.closing(control):
+        assert ask_socket(path, "disarm") == "disarm"
+
+
+def test_a_thread_that_cannot_be_started_does_not_end_the_socket(
+    served: tuple[Path, list[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, _ = served
+
+    def fail(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", fail)
+        for _ in range(2 * control_socket.MAX_UNREAD):
+            with pytest.raises((RunError, OSError)):
+                ask_socket(path, "status")
+    assert ask_socket(path, "disarm") == "disarm"
+
+
+@pytest.mark.parametrize("lists", [b"[" * 4000, b"[" * 900 + b"]" * 900, b"[" * 400 + b"]" * 400])
+@pytest.mark.parametrize("start", [b"", b'{"command": '])
+def test_what_is_nested_too_deep_is_refused(
+    served: tuple[Path, list[Any]], start: bytes, lists: bytes
+) -> None:
+    path, asked = served
+    reply = talk(path, (start + lists + b"}")[: control_socket.LONGEST_REQUEST - 1] + b"\n")
+    assert "found no request" in reply["error"]
+    assert asked == []
+
+
+def test_connections_that_say_nothing_keep_no_request_out(
+    served: tuple[Path, list[Any]],
+) -> None:
+    path, _ = served
+    with contextlib.ExitStack() as stack:
+        for _ in range(3 * control_socket.MAX_UNREAD):
+            link = stack.enter_context(socket.socket(socket.AF_UNIX))
+            link.settimeout(PATIENCE)
+            wait_for(lambda link=link: connects(link, path), "a place among the waiting")
+        for command in ("status", "disarm"):
+            assert ask_socket(path, command) == command
+
+
+def connects(link: socket.socket, path: Path) -> bool:
+    with contextlib.suppress(BlockingIOError):  # too many wait to be accepted
+        link.connect(str(path))
+        return True
+    return False
+
+
+def test_requests_that_wait_for_their_answer_keep_no_disarm_out(tmp_path: Path) -> None:
+    begun, go_on = threading.Semaphore(0), threading.Event()
+
+    def answer(command: str, _: Peer) -> dict[str, Any]:
+        if command == "arm":
+            begun.release()
+            assert go_on.wait(PATIENCE)
+        return {"ok": True, "answer": command}
+
+    path = tmp_path / "x.sock"
+    with (
+        ControlSocket(path, answer, SYSTEM),
+        ThreadPoolExecutor(control_socket.MAX_REQUESTS) as pool,
+    ):
+        number = control_socket.MAX_REQUESTS
+        armed = [pool.submit(talk, path, b'{"command": "arm"}\n') for _ in range(number)]
+        try:
+            assert all(begun.acquire(timeout=PATIENCE) for _ in range(number))
+            with pytest.raises(RunError, match="not answered yet"):
+                ask_socket(path, "status")
+            assert ask_socket(path, "disarm") == "disarm"
+        finally:
+            go_on.set()
+        assert all(each.result(PATIENCE)["ok"] for each in armed)
+        assert ask_socket(path, "status") == "status"
+
+
+def test_a_daemon_that_does_not_answer_is_not_taken_for_none(tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text("robot: {model: ur10e}\n")
+    path = runtime_folder() / f"{cell_key(cell)}.sock"
+    with socket.socket(socket.AF_UNIX) as listener, socket.socket(socket.AF_UNIX) as other:
+        listener.bind(str(path))
+        listener.listen(0)
+        other.connect(str(path))  # and nobody accepts
+        with pytest.raises(RunError, match="unavailable, expected an answer of the daemon"):
+            ask(cell, "disarm")
+    with pytest.raises(InputError, match="found no running daemon"):
+        ask(cell, "disarm")  # its socket is left
 
 
 def test_a_folder_of_somebody_else_is_not_used(

@@ -224,6 +224,8 @@ def test_a_feed_that_falls_silent_is_dry_and_may_come_back(feed: PlannerSource) 
 
 GOOD = json.dumps({"q": [0, 0, 0]}).encode() + b"\n"
 BAD = ["1,2", "1,2,3,4", "1,2,nan", "1,2,inf", "a,b,c", '{"p": 1}', '{"q": 5}', "{", "[" * 99,
+       "[" * 3000, '{"q":' + "[" * 3000, '{"q": "123"}', '{"q": [true, 0, 0]}',
+       '{"q": ["1", 0, 0]}', '{"q": [1' + "0" * 400 + ", 0, 0]}", '{"q": {"1": 0, "2": 0, "3": 0}}',
        "GET / HTTP/1.1", "POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n", "\x16\x03\x01"]  # fmt: skip
 
 

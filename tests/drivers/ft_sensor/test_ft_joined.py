@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import termios
 import threading
 import time
 from collections import deque
@@ -103,6 +104,31 @@ class ListedSensor(ForceTorqueSensor):
         pass
 
 
+class BreakingSensor(ListedSensor):
+    """Its link breaks with any error after the first sample, and works again once mended."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__([Reading(0.0, 0.0, np.zeros(6))])
+        self.error, self.opened, self.closed = error, 0, 0
+        self.mended = threading.Event()
+
+    def connect(self) -> None:
+        self.opened += 1
+        if self.opened > 1:
+            assert self.mended.wait(PATIENCE)
+
+    def read(self, timeout: float) -> Reading | None:
+        if self.opened > 1:
+            self.left.append(Reading(0.0, 0.0, np.ones(6)))
+            time.sleep(0.001)
+        if not self.left:
+            raise self.error
+        return super().read(timeout)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
 def model(**changed: Any) -> Model:
     return replace(
         Model(builtin_arm("ur10e"), TOOL, payload_mass=MASS, payload_cog=np.array(COG)), **changed
@@ -164,6 +190,20 @@ def test_the_controllers_declared_payload_stands_instead_of_the_models() -> None
     wrong = model(payload_mass=1.0)
     with wire.device, DriverWithSensor(arm, wire.settings(**MOUNTED), wrong) as driver:
         assert np.all(np.abs(driver.read_state().actual_TCP_force) <= bounds("robotous_rft"))
+
+
+def test_a_load_in_the_effects_weighs_on_the_sensor_and_is_no_external_force() -> None:
+    controller = resting_controller(TURNED)
+    wire = make_wire("robotous_rft", reaction_of(controller))
+    shift = (0.03, 0.01, -0.02)
+    undeclared = model(
+        payload_mass=MASS - 1.0,
+        payload_cog=np.array(COG) - shift,
+        terms=(Term("payload", Site(), (1.0,)), Term("payload_cog", Site(), shift)),
+    )
+    with wire.device, joined(wire, controller, undeclared) as driver:
+        for _ in range(3):  # each cycle begins with what is declared
+            assert np.all(np.abs(driver.read_state().actual_TCP_force) <= bounds("robotous_rft"))
 
 
 def test_an_arm_may_keep_its_own_tcp_force() -> None:
@@ -261,6 +301,43 @@ def test_a_cut_serial_line_is_reported_and_opened_anew(tmp_path: Any) -> None:
 
 
 @pytest.mark.parametrize(
+    "error",
+    [IndexError("index out of range"), RuntimeError(), termios.error(5, "Input/output error")],
+)
+def test_any_error_of_a_sensors_link_is_reported_and_the_link_opened_anew(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sensor = BreakingSensor(error)
+    monkeypatch.setattr(joined_module, "make_sensor", lambda *_: sensor)
+    settings = settings_of(driver="ati_netcanoem", interface="virtual", channel="none")
+    arm = ControllerDriver(resting_controller(TURNED), clock=Standing())
+    with DriverWithSensor(arm, settings, model()) as driver:
+        reader = driver._reader
+        wait_for(lambda: sensor.opened == 2, "a second attempt")
+        assert sensor.closed == 1
+        assert type(error).__name__ in reader._why()
+        sensor.mended.set()
+        wait_for(lambda: bool(reader.at(0.0).wrench[0] == 1.0), "samples of the mended link")
+        assert reader._why() == ""
+
+
+def test_any_error_of_the_first_connection_is_a_link_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sensor = ListedSensor([])
+
+    def fail() -> None:
+        raise IndexError("index out of range")
+
+    monkeypatch.setattr(sensor, "connect", fail)
+    monkeypatch.setattr(joined_module, "make_sensor", lambda *_: sensor)
+    settings = settings_of(driver="ati_netcanoem", interface="virtual", channel="none")
+    driver = DriverWithSensor(ControllerDriver(resting_controller(TURNED)), settings, model())
+    with pytest.raises(LinkError, match="force-torque sensor: IndexError: index out of range"):
+        driver.connect()
+
+
+@pytest.mark.parametrize(
     ("limits", "phrase"),
     [({"force": 30.0}, r"force of 39\.\d N.*overload\.force"),
      ({"torque": 0.5}, r"torque of .* Nm.*overload\.torque")],
@@ -273,6 +350,23 @@ def test_more_than_the_sensor_may_carry_is_not_believed(
     driver = joined(wire, controller, overload=limits)
     with wire.device, driver, pytest.raises(InvalidStateError, match=phrase):
         driver.read_state()
+
+
+def test_a_wrench_between_two_samples_is_believed_only_if_both_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    samples = [Reading(0.01 * k, 0.01 * k, np.zeros(6), status=int(k == 2)) for k in range(5)]
+    sensor = ListedSensor(samples)
+    monkeypatch.setattr(joined_module, "make_sensor", lambda *_: sensor)
+    settings = settings_of(driver="ati_netcanoem", interface="virtual", channel="none")
+    arm = ControllerDriver(resting_controller(TURNED), clock=Standing())
+    with DriverWithSensor(arm, settings, model()) as driver:
+        assert sensor.emptied.wait(PATIENCE)
+        for moment in (0.015, 0.025):
+            with pytest.raises(InvalidStateError):
+                driver._reader.at(moment)
+        for moment in (0.005, 0.035):
+            assert np.all(driver._reader.at(moment).wrench == 0.0)
 
 
 def test_the_sensors_own_overload_bits_are_not_believed_and_pass() -> None:
@@ -365,3 +459,35 @@ def test_setpoints_and_the_arms_own_wishes_pass_through() -> None:
         assert np.array_equal(driver.nominal_q(state), state.target_q)
         assert (driver.rate, driver.n, driver.moves_arm) == (500.0, 6, True)
         driver.release()
+
+
+class LapsingDriver(ControllerDriver):
+    """An arm whose setpoints may become too old, as those that wait for a SYNC do."""
+
+    lapsed = False
+
+    def _take_lapsed(self) -> bool:
+        lapsed, self.lapsed = self.lapsed, False
+        return lapsed
+
+
+def test_a_setpoint_of_the_arm_that_lapsed_is_taken_back_once() -> None:
+    controller = resting_controller(TURNED)
+    wire, arm = make_wire("robotous_rft", reaction_of(controller)), LapsingDriver(controller)
+    with wire.device, DriverWithSensor(arm, wire.settings(**MOUNTED), model()) as driver:
+        state = driver.read_state()
+        driver.arm(state)
+        q = state.target_q
+        for way in (0.0, 0.001):
+            driver.write_setpoint(Setpoint(q + way, q, np.zeros(6)), expiry=7.0)
+        assert len(arm.written) == 2
+        assert arm._expiry == 7.0
+        assert not driver.take_lapsed()
+        assert driver.gate._joints[2] == pytest.approx(q + 0.001, abs=1e-12)
+        arm.lapsed = True
+        assert driver.take_lapsed()
+        assert driver.gate._joints[2] == pytest.approx(q, abs=1e-12), "as before the lapsed one"
+        assert not driver.take_lapsed(), "once"
+        driver.release()
+        with pytest.raises(WriteError, match=r"arm\(\) first"):
+            driver.write_setpoint(Setpoint(q, q, np.zeros(6)))

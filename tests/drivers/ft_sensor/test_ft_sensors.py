@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import termios
 import threading
 import time
 from typing import Any
@@ -33,6 +34,7 @@ from sensor_wires import (
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.ft_sensor import FT_SENSORS, make_sensor
+from gapbridge.drivers.ft_sensor.can_sensor import CanSensor
 from gapbridge.drivers.ft_sensor.joined import sensor_to_flange
 from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode, RobotousNode
 from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
@@ -192,6 +194,38 @@ def test_a_write_that_times_out_is_one_attempt(monkeypatch: pytest.MonkeyPatch) 
     with wire.device, make_sensor(wire.settings(), SYSTEM) as sensor:
         assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.02)
     assert not late
+
+
+def test_a_line_that_cannot_be_flushed_is_one_attempt(monkeypatch: pytest.MonkeyPatch) -> None:
+    wire, flush = make_wire("robotiq_ft300", Reaction()), serial.Serial.flush
+    failing = [termios.error(5, "Input/output error")]
+
+    def failed_once(line: serial.Serial) -> None:
+        if failing:
+            raise failing.pop()
+        flush(line)
+
+    monkeypatch.setattr(serial.Serial, "flush", failed_once)
+    with wire.device, make_sensor(wire.settings(), SYSTEM) as sensor:
+        assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.02)
+    assert not failing
+
+
+@pytest.mark.parametrize("kind", ["robotous_rft", "ati_netcanoem"])
+def test_any_error_of_a_can_adapter_is_a_broken_link(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wire = make_wire(kind, Reaction())
+
+    def cut(*_: Any, **__: Any) -> None:
+        raise IndexError("index out of range")  # slcan's, for a line that was cut short
+
+    with wire.device, make_sensor(wire.settings(), SYSTEM) as sensor:
+        next_reading(sensor)
+        assert isinstance(sensor, CanSensor)
+        monkeypatch.setattr(sensor._bus, "recv", cut)
+        with pytest.raises(LinkError, match=f"{kind}.*index out of range"):
+            next_reading(sensor)
 
 
 @pytest.mark.parametrize("late", [0.6, 1.3])
