@@ -22,7 +22,7 @@ from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
-from gapbridge.bridge.loop.writing import PARTIAL_WRITE_LIMIT, Writing
+from gapbridge.bridge.loop.writing import PARTIAL_WRITE_LIMIT, SETTLING_TIMEOUT, Writing
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import Correction
@@ -461,6 +461,28 @@ def test_faults_and_armings_in_turn_do_not_add_up(bench: Bench) -> None:
         bench.rearm()
     assert shifts[0] > 1e-4
     assert shifts == pytest.approx([shifts[0]] * 4, rel=1e-3)
+
+
+def test_each_motion_has_its_own_time_to_settle(bench: Bench) -> None:
+    def settles(away: float) -> bool:
+        bench.supervisor.state = State.HOLDING
+        state = bench.state()
+        setpoint = bench.writing.write(state, bench.q, bench.loads.update(state))
+        assert setpoint is not None
+        assert bench.stream.at_rest
+        return bench.writing.at_rest(setpoint, state._replace(target_q=setpoint.q + away))
+
+    bench.supervisor.state = State.HOLDING
+    bench.cycles(2000)
+    assert not settles(1e-3)
+    bench.supervisor.state = State.FAULT
+    bench.writing.release()
+    CLOCK.sleep(2.0 * SETTLING_TIMEOUT)
+    bench.rearm()
+    bench.supervisor.state = State.HOLDING
+    bench.cycles(2000)
+    assert not settles(1e-3)  # the time of the motion before does not count
+    assert settles(0.0)
 
 
 def test_a_beginning_with_an_offset_in_force_makes_no_step(bench: Bench) -> None:
