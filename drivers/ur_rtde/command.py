@@ -313,10 +313,15 @@ class OffsetWriter:
                 )
 
     def keep_alive(self) -> None:
-        """Raise WriteError if an offset has not been accepted in time.
+        """Raise WriteError if an offset has not been accepted in time, or the program is gone.
 
         The sequence number of each offset is the heartbeat.
         """
+        if self._program == Program.ABSENT:
+            raise WriteError(
+                f"{self._settings.host}: output_int_register_{registers.PROGRAM}: found 0, "
+                f"expected {Program.RUNNING:d}: the robot's program has ended"
+            )
         late = self._now() - self.unanswered_since()
         if late > self._settings.echo:
             raise WriteError(f"{self._silence()} (sent {late:.3f} s ago)")
