@@ -106,6 +106,8 @@ class ServoWriter:
             self._control.reuploadScript()
             self._wait_running()
         if not self._control.setWatchdog(self._settings.watchdog):
+            with contextlib.suppress(WriteError):
+                self.release()  # else our own script is what the next arming is refused for
             raise WriteError(f"{host}: the controller refused the watchdog")
         self._count, self._kicked = 0, 0.0
 

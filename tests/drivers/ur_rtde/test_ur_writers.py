@@ -179,6 +179,15 @@ def test_the_robots_watchdog_is_fed_before_it_expires(servo: Servo, kept: bool) 
     assert np.diff(kicks).max() < (KICK + 2 * CYCLE if kept else 0.5 / SETTINGS.watchdog)
 
 
+@pytest.mark.parametrize("also", [set[str](), {"servoStop"}])
+def test_a_refused_watchdog_leaves_no_script_of_ours_running(also: set[str]) -> None:
+    servo = Servo()
+    servo.library.refused = {"setWatchdog", *also}
+    with pytest.raises(WriteError, match="refused the watchdog"):
+        servo.arm(state(runtime_state=STOPPED), lambda: None)
+    assert servo.library.calls[-1] == ("stopScript",)
+
+
 def test_a_running_program_is_not_ended_by_arming() -> None:
     servo = Servo()
     with pytest.raises(WriteError, match="found a program running"):
