@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from gapbridge.core.errors import (
     ForeignCommandError,
     GateError,
     IneffectiveWriteError,
+    InputError,
     LateSetpointError,
     LinkError,
     PartialWriteError,
@@ -529,6 +531,29 @@ def test_an_offset_in_force_outlives_the_process_that_left_it(tmp_path: Path) ->
     kept.note(np.full(6, 0.4), np.zeros(6), np.zeros(6))
     assert kept.offset_at(np.full(6, 0.4)) is None
     assert OffsetInForce(7, path).offset_at(np.zeros(7)) is None  # another arm
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="the system reserves no space")
+def test_the_place_of_an_offset_in_force_is_reserved_or_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "arm.offset"
+    size = 8 * (1 + 2 * (2 * 6 + 6))
+    with path.open("wb") as hole:
+        hole.truncate(size)
+    kept = OffsetInForce(6, path)
+    assert path.stat().st_size == size
+    assert 512 * path.stat().st_blocks >= size
+    assert kept.offset_at(Q) is None
+
+    def is_full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", is_full)
+    with pytest.raises(InputError, match=r"arm\.offset: .* cannot be kept: No space left"):
+        OffsetInForce(6, path)
+    with pytest.raises(InputError, match="none/arm"):
+        OffsetInForce(6, tmp_path / "none" / "arm.offset")
 
 
 def test_a_clock_that_goes_back_withdraws_the_offset_step_by_step(bench: Bench) -> None:
