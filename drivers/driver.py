@@ -218,6 +218,14 @@ class Driver(ABC):
         """
         return None
 
+    def take_round_trip(self) -> float | None:
+        """Return, once, a round-trip time measured since arming, s; None: no new one.
+
+        Never waits; called in each cycle, so that a delay that grows is told from clocks that
+        drift. Only a link with a clock of the controller needs it.
+        """
+        return None
+
     def transit_time(self) -> float:
         """Return an upper bound of the last sample's transit time from the controller, s.
 

@@ -93,6 +93,8 @@ LATER = (
     Fault("cell file read again", process.reload, weight=2.0),
 )
 """Families that were added later: see ``drawn``."""
+SLOW = (Fault("delay that grows", wire.grow, (*_UR, *_MODBUS)),)
+"""Families that take longer than a drawn run: in plans only."""
 ALL = (*FAULTS, *LATER)
 SHARE = 0.4  # of faults that are of LATER
 

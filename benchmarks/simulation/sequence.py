@@ -11,7 +11,7 @@ from benchmarks.faults.invariants import Checker
 from benchmarks.simulation.can import CanLink
 from benchmarks.simulation.canopen import CanopenLink
 from benchmarks.simulation.disk import recorded_on
-from benchmarks.simulation.faults import ALL, Fault, drawn
+from benchmarks.simulation.faults import ALL, SLOW, Fault, drawn
 from benchmarks.simulation.invariants import Judge, Violation
 from benchmarks.simulation.links import Setting, SimulatedLink, setting_of
 from benchmarks.simulation.modbus import ModbusLink, ModbusTargetLink
@@ -125,7 +125,7 @@ def _fate(
     if more is not None and moves_arm and more.random() < 0.5:
         joint = 0  # turns about gravity: its own offset is none, and the checker leaves it out
     if given is not None:
-        by_name = {fault.name: fault for fault in ALL}
+        by_name = {fault.name: fault for fault in (*ALL, *SLOW)}
         plan = [(moment, by_name[name]) for moment, name in given]
     else:
         faults = drawn(draw, more, setting.name, draw.randint(0, MOST_FAULTS))

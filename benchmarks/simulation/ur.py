@@ -34,7 +34,7 @@ from gapbridge.drivers.simulated.ur.programs.offset_program import (
 from gapbridge.drivers.ur_rtde import command, registers
 from gapbridge.drivers.ur_rtde import driver as ur_driver
 from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
-from gapbridge.drivers.ur_rtde.enquiry import TRIES
+from gapbridge.drivers.ur_rtde.enquiry import ASK_EVERY, TRIES
 
 UPLOAD = 0.1  # s that uploading a script takes
 DEAD_AFTER = 0.3  # s of a broken connection until the library says so
@@ -127,14 +127,19 @@ class UrLink(SimulatedLink):
 
     def ask(self) -> float:
         """Return how long a question and its answer take now, s."""
-        way = max(self.down.held_until - self.world.now, 0.0)
-        for wire in (self.up, self.down):
-            way += wire.delay + self.world.random.uniform(0.0, wire.jitter)
+        way = self.round_trip(self.world.random)
         self.clock.sleep(min(way, 1.0))
         if self.up.is_cut or way > 1.0:
             from gapbridge.core.errors import WriteError
 
             raise WriteError("found no answer on RTDE's port 30004")
+        return way
+
+    def round_trip(self, draw: Any) -> float:
+        """Return how long a question asked now and its answer are under way, s."""
+        way = max(self.down.held_until - self.world.now, 0.0)
+        for wire in (self.up, self.down):
+            way += wire.delay_now + draw.uniform(0.0, wire.jitter)
         return way
 
     @property
@@ -356,6 +361,38 @@ class _Receive:
     def disconnect(self) -> None: ...
 
 
+class _RoundTrip:
+    """RoundTrip of the driver: questions on a connection of its own."""
+
+    def __init__(self, link: UrLink) -> None:
+        self._link = link
+        self._draw = random.Random(0)  # not the world's: a seed is the run that it was before
+        self.close()
+
+    def measure(self) -> float:
+        """Return the median of some. Raises WriteError."""
+        self.close()
+        found = median(self._link.ask() for _ in range(TRIES))
+        self._is_open = True
+        return found
+
+    def poll(self) -> float | None:
+        """Return the last one, once, where its answer has come, s, and ask again in time."""
+        now = self._link.world.now
+        if not self._is_open or self._link.up.is_cut:
+            return None
+        if self._way == math.inf and now - self._asked >= ASK_EVERY:
+            self._asked, self._way = now, self._link.round_trip(self._draw)
+        elif self._asked + self._way <= now:
+            self._way = math.inf
+            return now - self._asked
+        return None
+
+    def close(self) -> None:
+        """Drop the connection."""
+        self._is_open, self._asked, self._way = False, -1e9, math.inf
+
+
 def _control_class(link: UrLink) -> type:
     class RTDEControlInterface:
         """The library's writing half, through its control script."""
@@ -384,7 +421,7 @@ def _control_class(link: UrLink) -> type:
         def kickWatchdog(self) -> bool:
             link.wrote("other", (), "kick")
             link.up.send(("kick", None))
-            link.clock.sleep(min(link.up.delay + link.down.delay, 0.2))
+            link.clock.sleep(min(link.up.delay_now + link.down.delay_now, 0.2))
             return True
 
         def isConnected(self) -> bool:
@@ -449,14 +486,14 @@ def library(link: SimulatedLink) -> Iterator[None]:
         return
     modules = link.modules()
     before = {name: sys.modules.get(name) for name in modules}
-    at_once, round_trip = command.send_at_once, ur_driver.round_trip
+    at_once, round_trip = command.send_at_once, ur_driver.RoundTrip
     sys.modules.update(modules)
     command.send_at_once = lambda: 0
-    ur_driver.round_trip = lambda *_: median(link.ask() for _ in range(TRIES))
+    ur_driver.RoundTrip = lambda *_: _RoundTrip(link)  # type: ignore[assignment,misc]
     try:
         yield
     finally:
-        command.send_at_once, ur_driver.round_trip = at_once, round_trip
+        command.send_at_once, ur_driver.RoundTrip = at_once, round_trip  # type: ignore[misc]
         for name, module in before.items():
             if module is None:
                 del sys.modules[name]

@@ -29,6 +29,12 @@ def delay_step(run: Run, draw: Draw) -> str:
     return f"down {run.link.down.delay:.4f} s, up {run.link.up.delay:.4f} s"
 
 
+def grow(run: Run, draw: Draw) -> str:
+    """Have the way become longer so slowly that it looks like a clock that drifts."""
+    run.link.down.grow(draw.choice((5e-4, 2e-3, 4.5e-3)))
+    return f"{run.link.down.growth:g} s per s"
+
+
 def jitter(run: Run, draw: Draw) -> str:
     """Have each message take another while."""
     most = 0.002 if isinstance(run.link, BUSES) else 0.1

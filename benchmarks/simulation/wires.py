@@ -31,6 +31,7 @@ class Wire(Generic[Message]):
     def heal(self) -> None:
         """Be as a quiet network is."""
         self.delay, self.jitter = WAY, 5e-5
+        self.growth, self._grows_since = 0.0, 0.0  # s per s, s
         self.held_until = 0.0
         self.lost = self.doubled = 0.0  # share of messages
         self.change: Callable[[Message], Message] | None = None
@@ -40,6 +41,15 @@ class Wire(Generic[Message]):
     def hold(self, seconds: float) -> None:
         """Keep what is sent, and hand it on all at once."""
         self.held_until = self._world.now + seconds
+
+    def grow(self, growth: float) -> None:
+        """Have the delay grow from now on, s per s."""
+        self.growth, self._grows_since = growth, self._world.now
+
+    @property
+    def delay_now(self) -> float:
+        """Return how long a message is under way, without jitter, s."""
+        return self.delay + self.growth * (self._world.now - self._grows_since)
 
     def cut(self) -> None:
         """Lose what is under way, and all that is sent."""
@@ -57,7 +67,8 @@ class Wire(Generic[Message]):
         times = 2 if self.doubled and world.random.random() < self.doubled else 1
         for _ in range(times):
             now, held = world.now, self.held_until
-            at = (now if now > held else held) + self.delay + self.jitter * world.random.random()
+            at = now if now > held else held
+            at += self.delay_now + self.jitter * world.random.random()
             if self._ordered:
                 at = self._newest = at if at > self._newest else self._newest
             world.at(at, partial(self._arrive, message, self._generation))

@@ -13,7 +13,9 @@ from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.driver import Driver
 
-DRIFT = 5e-3  # s per s: how fast the clock offset may grow
+DRIFT = 1e-3  # s per s: how fast the clock offset may grow: quartz 1e-4, a clock set by NTP 5e-4
+GROWTH = 5e-3  # s by which it may grow once armed, beyond what a round trip has shown
+ROUND_TRIP_SPAN = 1.0  # s of which the earliest sample and the shortest round trip are compared
 INVALID_STATE_LIMIT = 3  # implausible states in a row that end the compensation
 CLOCK_STEP = 0.01  # s that the controller's clock may gain on ours from one sample to the next
 STEP_TOLERANCE = 2e-3  # s: clock offsets that differ by less agree
@@ -42,6 +44,8 @@ class ControllerClock:
     older than ``hold`` for as long, either the controller's clock stopped or the transit time grew,
     which no clock shows: the offset is estimated again only while the driver is not armed, since
     arming measures the round trip before anything is written.
+    A delay that grows slowly looks like drift. Once armed, the offset therefore follows by GROWTH
+    at most, and further only as far as another round trip shows that it was drift (``measured``).
     If the controller's clock gains on this machine's, either it was set forward or the link
     delivers delayed samples: the sample counts as one period after the last, until some in a row
     agree with the offset from before.
@@ -56,6 +60,12 @@ class ControllerClock:
         self._offset_before_step: float | None = None  # s, of the controller's clock
         self._agreeing = 0  # samples in a row that agree with that offset
         self._old_since: float | None = None  # s, monotonic: all samples since were old
+        self._most_offset = math.inf  # s: the offset follows drift no further
+        self._restart_span(0.0)
+
+    def _restart_span(self, now: float) -> None:
+        self._span_begin = now  # s, monotonic
+        self._earliest = self._shortest = math.inf  # s: offset of a sample, round trip
 
     def take(self, state: RobotState, transit_known: bool = False) -> int:
         """Take a new sample; returns the cycles missed since the one before.
@@ -66,14 +76,22 @@ class ControllerClock:
         offset, before, counts = state.received - state.timestamp, self._last, self._counts
         self._last, self._counts = (state.timestamp, state.received), True
         gap = 0.0 if before is None else state.timestamp - before[0]
+        if not transit_known:
+            self._most_offset = math.inf
+            self._restart_span(state.received)
+        elif self._offset is not None and self._most_offset == math.inf:
+            self._most_offset = self._offset + GROWTH
+        self._earliest = min(self._earliest, offset)
         if self._offset is None or (self._outdated(offset, state.received) and not transit_known):
             self._offset, self._old_since, self._offset_before_step = offset, None, None
         else:
             # no drift over a gap: the first state after it would seem younger than it can be
             drifted = self._offset + DRIFT * (gap if gap <= self._hold else 0.0)
+            drifted = max(min(drifted, self._most_offset), self._offset)
             elapsed = 0.0 if before is None else state.received - before[1]
             step = gap - 1.0 / self._rate if gap - elapsed > CLOCK_STEP else 0.0
             self._offset = min(offset, self._offset_after_step(offset, drifted, step))
+            self._most_offset = min(self._most_offset, offset + GROWTH)
         return max(round(gap * self._rate) - 1, 0) if counts and before is not None else 0
 
     def _offset_after_step(self, offset: float, drifted: float, step: float) -> float:
@@ -93,6 +111,7 @@ class ControllerClock:
         self._agreeing = self._agreeing + 1 if abs(later) <= STEP_TOLERANCE else 0
         if self._agreeing >= STEP_REVOKED_AFTER:
             drifted, self._offset_before_step = self._offset_before_step, None
+            self._most_offset = max(self._most_offset, drifted + GROWTH)
         elif later < -STEP_TOLERANCE:  # earlier than any sample before: the clock was set
             self._offset_before_step = None
         return drifted
@@ -104,6 +123,18 @@ class ControllerClock:
         elif self._old_since is None:
             self._old_since = now
         return self._old_since is not None and now - self._old_since > self._hold
+
+    def measured(self, round_trip: float, transit_time: float) -> None:
+        """Take a round trip (s) just measured; ``transit_time``: that counts in every age, s.
+
+        No sample was under way for longer than the shortest round trip of the same time.
+        """
+        self._shortest = min(self._shortest, round_trip)
+        now = self._now()
+        if now - self._span_begin >= ROUND_TRIP_SPAN:
+            shown = self._earliest - self._shortest + transit_time
+            self._most_offset = max(self._most_offset, shown + GROWTH)
+            self._restart_span(now)
 
     def skip(self) -> None:
         """Do not count the cycles until the next sample as missed: the loop does not read."""
@@ -187,7 +218,10 @@ class LinkMonitor:
         self._old = self._old + 1 if now > expiry else 0
         self._invalid = 0
         if self._old >= OLD_STATE_LIMIT:
-            self._judge_stale(f"states are {now - expiry + self._hold:.3f} s old as they come")
+            self._judge_stale(
+                f"states are {now - expiry + self._hold:.3f} s old as they come: the link delays "
+                "them, or a clock runs wrong"
+            )
             return False
         if self._old:
             self._reports.count(LoopCounter.LATE)

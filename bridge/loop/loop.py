@@ -292,6 +292,8 @@ class Loop:
             self._end_on_lost_link(self._watch.lost)
             return
         missed = self._clock.take(state, transit_known=self._writing.ready)
+        if self._writing.ready and (round_trip := self._driver.take_round_trip()) is not None:
+            self._clock.measured(round_trip, self._writing.transit_time)
         expiry = self._clock.expiry(state) - self._writing.transit_time
         is_fresh = self._watch.accept(expiry)
         self._end_on_lost_link(self._watch.lost)

@@ -16,6 +16,7 @@ import numpy as np
 
 from gapbridge.bridge.cell.runtime_folder import runtime_folder
 from gapbridge.core.arrays import Array
+from gapbridge.core.errors import InputError
 from gapbridge.drivers.controller_address import address_of
 from gapbridge.drivers.link_settings import DriverSettings
 
@@ -34,6 +35,7 @@ class OffsetInForce:
 
     Two records are written in turn, then the index of the valid one: if the process ends in
     between, the previous record stays valid. ``path`` None: kept in memory only.
+    Raises InputError where the file cannot be used, as in a full folder.
     """
 
     def __init__(self, n: int, path: Path | None) -> None:
@@ -43,14 +45,12 @@ class OffsetInForce:
         if path is None:
             self._memory = bytearray(8 * count)
         else:
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
             try:
-                if os.fstat(fd).st_size != 8 * count:  # new, or of another arm
-                    os.ftruncate(fd, 0)
-                    os.ftruncate(fd, 8 * count)
-                self._memory = mmap.mmap(fd, 8 * count)
-            finally:
-                os.close(fd)
+                self._memory = _mapped(path, 8 * count)
+            except OSError as error:
+                raise InputError(
+                    f"{path}: the offset that remains in the arm cannot be kept: {error.strerror}"
+                ) from None
         numbers = np.frombuffer(self._memory, np.float64)
         self._which = numbers[:1]  # 0: none; 1, 2: the valid record
         self._places = numbers[1:].reshape(2, size)
@@ -58,7 +58,7 @@ class OffsetInForce:
 
     @classmethod
     def of_link(cls, n: int, link: DriverSettings) -> Self:
-        """Return the store for one controller. Raises InputError without a runtime folder."""
+        """Return the store for one controller. Raises InputError without a place for it."""
         key = hashlib.sha256(address_of(link).encode()).hexdigest()[:16]
         return cls(n, runtime_folder() / f"{key}.offset")
 
@@ -83,3 +83,18 @@ class OffsetInForce:
         if not stayed or not row[n : 2 * n].any():
             return None
         return InForce(row[n : 2 * n].copy(), row[2 * n :].copy())
+
+
+def _mapped(path: Path, size: int) -> mmap.mmap:
+    """Return a file of ``size`` bytes in memory. Raises OSError."""
+    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    try:
+        if os.fstat(fd).st_size != size:  # new, or of another arm
+            os.ftruncate(fd, 0)
+            os.ftruncate(fd, size)
+        if hasattr(os, "posix_fallocate"):
+            # writing to a hole of a full folder would end the process by SIGBUS
+            os.posix_fallocate(fd, 0, size)
+        return mmap.mmap(fd, size)
+    finally:
+        os.close(fd)

@@ -105,7 +105,7 @@ class Writing:
             self._refuse_start(str(error))
             return True
         self._source.begin(state.timestamp, start_q)
-        self._failed, self._refused = 0, False
+        self._failed, self._refused, self._settling = 0, False, 0.0
         self._supervisor.take(Cause.WRITING)
         return False
 
@@ -300,6 +300,7 @@ class Writing:
     def release(self) -> None:
         """Release the driver; the arm is at rest, or has stopped because of a fault."""
         self._stream.end()
+        self._settling = 0.0  # of a motion that ended before the arm had settled
         if not self.ready:
             return
         self.ready = False

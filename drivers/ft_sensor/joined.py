@@ -101,6 +101,10 @@ class DriverWithSensor(Driver):
         """See Driver.round_trip."""
         return self._arm.round_trip()
 
+    def take_round_trip(self) -> float | None:
+        """See Driver.take_round_trip."""
+        return self._arm.take_round_trip()
+
     def transit_time(self) -> float:
         """See Driver.transit_time."""
         return self._arm.transit_time()

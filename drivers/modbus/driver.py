@@ -205,6 +205,15 @@ class ModbusDriver(Driver):
         """Return how long the last reading took, s; see Driver.round_trip."""
         return self._answer
 
+    def take_round_trip(self) -> float | None:
+        """Return how old the last reading may be by its request, s; see Driver.take_round_trip.
+
+        The controller's registers are up to a period older than its answer.
+        """
+        if self._answer is None or not self._freshness.has_clock:
+            return None
+        return self._answer + self.profile.period
+
     def transit_time(self) -> float:
         """Return how long the last reading took, s; see Driver.transit_time.
 

@@ -53,7 +53,7 @@ class Writer(Protocol):
         """
 
     def pending(self) -> tuple[int, list[int]] | None:
-        """Return, once, holding registers to be written with the next reading."""
+        """Return, once, holding registers to be written with the next reading, in time."""
 
     def release(self) -> None:
         """End the writing so that the arm comes to rest. Raises WriteError."""
@@ -128,7 +128,7 @@ class MailboxWriter:
         self._awaited = 0  # a sequence number that was not echoed yet
         self._sent = 0  # numbers since arming, up to the largest lag of an echo
         self._since = 0.0
-        self._pending: list[int] | None = None
+        self._pending: tuple[list[int], float] | None = None  # and its expiry, s monotonic
 
     def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
         """Send offsets of zero until the robot's program answers them. Raises WriteError.
@@ -181,7 +181,10 @@ class MailboxWriter:
             self._clock.sleep(ANNOUNCE)
 
     def write(self, setpoint: Setpoint, sample: Sample, expiry: float = math.inf) -> None:
-        """Send one offset. Raises WriteError if the program does not accept them."""
+        """Send one offset, or keep it for the next reading: it leaves before ``expiry`` or never.
+
+        Raises WriteError if the program does not accept them.
+        """
         if not self._armed:
             raise WriteError(f"{self._transport.name}: found no mailbox, expected arm() first")
         try:
@@ -197,7 +200,7 @@ class MailboxWriter:
                 self._awaited, self._since = self._sequence, self._now()
         words = self._words()
         if self._together:
-            self._pending = words
+            self._pending = words, expiry
             return
         try:
             self._transport.write("holding", self._box.address, words)
@@ -246,18 +249,20 @@ class MailboxWriter:
 
     def pending(self) -> tuple[int, list[int]] | None:
         """Return the registers of an offset that goes out with the next reading."""
-        words, self._pending = self._pending, None
-        return None if words is None else (self._box.address, words)
+        pending, self._pending = self._pending, None
+        if pending is None or self._now() > pending[1]:
+            return None
+        return self._box.address, pending[0]
 
     def release(self) -> None:
         """Send nothing more: without a heartbeat the program ramps out the offset.
 
         At the rates it was given; a zero from here would be a step.
         """
-        self._armed, pending, self._pending = False, self._pending, None
+        self._armed, pending = False, self.pending()
         if pending is not None and not any(self._counts):
             # the last setpoint of a ramp, which would have been sent with the next reading
-            self._transport.write("holding", self._box.address, pending)
+            self._transport.write("holding", *pending)
 
     def target(self) -> Array | None:
         """Return None: the joints are the robot's own."""

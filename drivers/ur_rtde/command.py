@@ -106,6 +106,8 @@ class ServoWriter:
             self._control.reuploadScript()
             self._wait_running()
         if not self._control.setWatchdog(self._settings.watchdog):
+            with contextlib.suppress(WriteError):
+                self.release()  # else our own script is what the next arming is refused for
             raise WriteError(f"{host}: the controller refused the watchdog")
         self._count, self._kicked = 0, 0.0
 
@@ -313,10 +315,15 @@ class OffsetWriter:
                 )
 
     def keep_alive(self) -> None:
-        """Raise WriteError if an offset has not been accepted in time.
+        """Raise WriteError if an offset has not been accepted in time, or the program is gone.
 
         The sequence number of each offset is the heartbeat.
         """
+        if self._program == Program.ABSENT:
+            raise WriteError(
+                f"{self._settings.host}: output_int_register_{registers.PROGRAM}: found 0, "
+                f"expected {Program.RUNNING:d}: the robot's program has ended"
+            )
         late = self._now() - self.unanswered_since()
         if late > self._settings.echo:
             raise WriteError(f"{self._silence()} (sent {late:.3f} s ago)")

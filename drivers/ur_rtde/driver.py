@@ -17,7 +17,7 @@ from gapbridge.drivers.controller_facts import TCP_TURNED, ControllerFacts, Diff
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.offset_inverse import Nominal
 from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
-from gapbridge.drivers.ur_rtde.enquiry import enquire, round_trip
+from gapbridge.drivers.ur_rtde.enquiry import RoundTrip, enquire
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 from gapbridge.drivers.ur_rtde.state import StateReader
 
@@ -42,7 +42,8 @@ class UrRtdeDriver(Driver):
             else OffsetWriter(settings, self._offset_rates, clock)
         )
         self._state: RobotState | None = None
-        self._round_trip = 0.0  # s: the last round trip
+        self._question = RoundTrip(settings.host, clock)
+        self._round_trip = 0.0  # s: the round trip when armed last
 
     def connect(self) -> None:
         """Open the receiving side only: changes no program and claims no input."""
@@ -83,8 +84,12 @@ class UrRtdeDriver(Driver):
 
     def round_trip(self) -> float | None:
         """Return the round-trip time of an RTDE request, s; see Driver.round_trip."""
-        self._round_trip = duration = round_trip(self.settings.host, self.clock)
+        self._round_trip = duration = self._question.measure()
         return duration
+
+    def take_round_trip(self) -> float | None:
+        """Return a round-trip time measured since, s; see Driver.take_round_trip."""
+        return self._question.poll()
 
     def transit_time(self) -> float:
         """Return the round-trip time measured when arming, s; see Driver.transit_time."""
@@ -147,6 +152,7 @@ class UrRtdeDriver(Driver):
 
     def _release(self) -> None:
         """Stop writing: servoStop and end of the script, or no more heartbeats."""
+        self._question.close()
         if self.reader.age > self.settings.state_timeout:
             raise WriteError(f"{self.settings.host}: the link is silent; the robot's watchdog acts")
         self._writer.release()
@@ -159,4 +165,5 @@ class UrRtdeDriver(Driver):
             pass
         finally:
             self._writer.abandon()
+            self._question.close()
             self.reader.close()

@@ -5,12 +5,13 @@ Reads only: no input is claimed, no program touched. Sources: Universal Robots, 
 int32 size and int8 type, robot states (16) of sub-packages, kinematics info (5) with the factory
 calibration, configuration data (6) with joint limits and nominal DH rows; big-endian.
 
-RTDE streams its samples, which therefore do not show their transit time: ``round_trip`` measures it
+RTDE streams its samples, which therefore do not show their transit time: ``RoundTrip`` measures it
 on a separate connection.
 """
 
 from __future__ import annotations
 
+import math
 import socket
 import struct
 from collections.abc import Iterator
@@ -32,6 +33,7 @@ SAME = 1e-3  # m, rad: nominal DH rows of one model
 TIMEOUT = 2.0  # s for each of the two
 LONGEST = 1.0  # s that the answer of a round trip may take
 TRIES = 5  # requests, of which the median is taken
+ASK_EVERY = 0.2  # s between two requests while armed
 STATE, KINEMATICS, CONFIGURATION = 16, 5, 6  # types of a package and its sub-packages
 LARGEST = 1 << 20  # bytes of a package
 _VERSION = struct.pack(">H", 2)  # of the protocol
@@ -101,26 +103,90 @@ def require_listening(host: str) -> None:
         ) from None
 
 
-def round_trip(host: str, clock: Clock) -> float:
-    """Return the median round-trip time of some requests, s: a bound of a sample's transit time.
+class RoundTrip:
+    """Round trips of a request that changes nothing, on a connection of its own.
 
-    Raises WriteError where none comes.
+    It bounds the transit time of the samples, which come on another. The connection stays open, so
+    that a round trip is measured again without waiting.
     """
-    question = struct.pack(">HB", 3 + len(_VERSION), ord("V")) + _VERSION
-    times = []
-    try:
-        with socket.create_connection((host, RTDE), LONGEST) as link:
-            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            with link.makefile("rb") as answers:
-                for _ in range(TRIES):
-                    begun = clock.monotonic()
-                    link.sendall(question)
-                    _answer(answers, "V")
-                    times.append(clock.monotonic() - begun)
-    except (OSError, EOFError) as error:
-        message = getattr(error, "strerror", None) or str(error)
-        raise WriteError(f"{host}: found no answer on RTDE's port {RTDE}: {message}") from None
-    return sorted(times)[TRIES // 2]
+
+    def __init__(self, host: str, clock: Clock) -> None:
+        self._host, self._now = host, clock.monotonic
+        self._link: socket.socket | None = None
+        self._received = b""
+        self._asked = -math.inf  # s, monotonic: when the last request was sent
+        self._waits = False  # for its answer
+
+    def measure(self) -> float:
+        """Return the median round-trip time of some requests, s. Waits; connects anew.
+
+        Raises WriteError where no answer comes.
+        """
+        self.close()
+        times = []
+        try:
+            self._link = socket.create_connection((self._host, RTDE), LONGEST)
+            self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for _ in range(TRIES):
+                self._ask(self._link)
+                while not self._is_answered(self._link):
+                    pass
+                times.append(self._now() - self._asked)
+            self._link.setblocking(False)
+        except (OSError, EOFError) as error:
+            self.close()
+            message = getattr(error, "strerror", None) or str(error)
+            raise WriteError(
+                f"{self._host}: found no answer on RTDE's port {RTDE}: {message}"
+            ) from None
+        return sorted(times)[TRIES // 2]
+
+    def poll(self) -> float | None:
+        """Return, once, the round-trip time of the last request, s, and ask again in time.
+
+        Never waits; None: no answer yet, or the connection has ended: the next ``measure`` opens
+        another.
+        """
+        if self._link is None:
+            return None
+        try:
+            if not self._waits:
+                if self._now() - self._asked >= ASK_EVERY:
+                    self._ask(self._link)
+            elif self._is_answered(self._link):
+                return self._now() - self._asked
+        except BlockingIOError:
+            pass
+        except (OSError, EOFError):
+            self.close()
+        return None
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._link is not None:
+            self._link.close()
+        self._link, self._received, self._waits = None, b"", False
+
+    def _ask(self, link: socket.socket) -> None:
+        self._asked, self._waits = self._now(), True
+        link.sendall(struct.pack(">HB", 3 + len(_VERSION), ord("V")) + _VERSION)
+
+    def _is_answered(self, link: socket.socket) -> bool:
+        """Read once and return whether the answer was among it; raises OSError, EOFError."""
+        data = link.recv(4096)
+        if not data:
+            raise EOFError("the connection has ended")
+        self._received += data
+        while len(self._received) >= 3:
+            size, kind = struct.unpack_from(">HB", self._received)
+            if size < 3:
+                raise EOFError(f"found a message of {size} bytes")
+            if len(self._received) < size:
+                break
+            self._received = self._received[size:]
+            if kind == ord("V"):
+                self._waits = False
+        return not self._waits
 
 
 def nominal_rows(model: str) -> Array:

@@ -75,5 +75,5 @@ def next_sequence(sequence: int) -> int:
 
 
 def reached(echo: int, sequence: int) -> bool:
-    """Return whether an echoed number is ``sequence`` or one after it."""
-    return (echo - sequence) % LAST_SEQUENCE < LAST_SEQUENCE // 2
+    """Return whether an echoed number is ``sequence`` or one after it; 0 is none at all."""
+    return echo != 0 and (echo - sequence) % LAST_SEQUENCE < LAST_SEQUENCE // 2

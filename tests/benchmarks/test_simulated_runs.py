@@ -30,7 +30,7 @@ from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.ipc.command_memory import Command, Commands
 from gapbridge.bridge.ipc.loop_state import State
-from gapbridge.bridge.loop import checks
+from gapbridge.bridge.loop import checks, link_monitor
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor
 from gapbridge.bridge.loop.loop import Loop
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
@@ -247,8 +247,11 @@ def test_a_clock_that_is_set_forward_behind_jitter_makes_no_state_younger(seed: 
     assert not when_four(seed).violations
 
 
-def test_a_clock_set_forward_as_the_next_packet_comes_late_is_no_violation_but_reported() -> None:
+def test_a_clock_set_forward_as_the_next_packet_comes_late_is_no_violation_but_reported(
+    monkeypatch: Patch,
+) -> None:
     """Seed 5024965: timestamps and arrivals are those of a clock that nobody touched."""
+    monkeypatch.setattr(link_monitor, "DRIFT", 5e-3)  # as it was: that run's setpoints leave
     found = when_four(5024965)
     assert not found.violations
     assert found.hidden > 0.05
@@ -272,6 +275,19 @@ def test_the_first_setpoint_of_a_stream_is_within_the_envelope_whatever_the_mode
         *(run(seed, plan=plan) for seed in range(CAN, CAN + 80, len(LINKS))),
     ]
     assert not [str(outcome) for outcome in found if outcome.violations]
+
+
+@pytest.mark.parametrize("link", ["ur_servoj", "ur_offset", "ur_sensor", "modbus"])
+def test_a_way_that_grows_as_slowly_as_a_clock_drifts_lets_no_state_look_younger(link: str) -> None:
+    found = run(0, plan=[(0.1, "delay that grows"), (20.0, "arm")], on=link)
+    assert not found.violations
+
+
+def test_a_way_that_grows_is_found_where_it_is_taken_for_drift(monkeypatch: Patch) -> None:
+    monkeypatch.setattr(link_monitor, "DRIFT", 5e-3)
+    monkeypatch.setattr(link_monitor, "GROWTH", math.inf)
+    found = run(0, plan=[(0.1, "delay that grows"), (20.0, "arm")], on="ur_offset")
+    assert {violation.invariant for violation in found.violations} == {"age"}
 
 
 def test_a_way_that_was_long_when_arming_was_refused_is_measured_anew() -> None:

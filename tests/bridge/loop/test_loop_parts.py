@@ -9,9 +9,10 @@ import time
 
 import numpy as np
 import pytest
+from clock_by_hand import ByHand
 
 from gapbridge.bridge.ipc.shared_memory import ROWS, Phase, RunMemory, SharedMemory, write_cycle
-from gapbridge.bridge.loop.link_monitor import DRIFT, ControllerClock
+from gapbridge.bridge.loop.link_monitor import DRIFT, GROWTH, ControllerClock
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.state import RobotState
@@ -174,6 +175,48 @@ def test_once_armed_samples_that_come_later_for_good_stay_old() -> None:
     late = state(3.002, now - 0.788)
     clock.take(late)
     assert clock.expiry(late) > late.received
+
+
+@pytest.mark.parametrize("growth", [5e-4, 4.5e-3])
+def test_a_delay_that_grows_is_no_drift_for_longer_than_a_round_trip_shows(growth: float) -> None:
+    hand, way = ByHand(), 0.001  # s
+    clock = ControllerClock(500.0, hold=0.04, clock=hand)
+    for k in range(round(0.1 / growth) * 500):
+        sampled, hand.now = 1.0 + 0.002 * k, 10.0 + (0.002 + growth * 0.002) * k
+        late = state(sampled, hand.now)
+        clock.take(late, transit_known=True)
+        clock.measured(way + growth * 0.002 * k, way)
+        hidden = hand.now - 9.0 - sampled - clock.age(late)
+        assert hidden <= GROWTH + 1e-9
+    assert clock.expiry(late) < late.received
+
+
+@pytest.mark.parametrize("drift", [1e-4, -1e-4, 5e-4])
+def test_a_clock_that_drifts_is_followed_while_round_trips_stay_short(drift: float) -> None:
+    hand, way = ByHand(), 0.001  # s
+    clock = ControllerClock(500.0, hold=0.04, clock=hand)
+    for k in range(100_000):
+        hand.now = 10.0 + 0.002 * k
+        now = state(1.0 + 0.002 * k * (1.0 - drift), hand.now)
+        clock.take(now, transit_known=True)
+        if k % 100 == 99:
+            clock.measured(way + 0.002, way)
+        assert clock.age(now) < 1e-3
+
+
+def test_without_round_trips_a_clock_is_followed_by_a_bound_once_armed() -> None:
+    hand = ByHand()
+    clock = ControllerClock(500.0, hold=0.04, clock=hand)
+    for k in range(100_000):
+        hand.now = 10.0 + 0.002 * k * (1.0 + 5e-4)
+        late = state(1.0 + 0.002 * k, hand.now)
+        clock.take(late, transit_known=True)
+    assert clock.age(late) == pytest.approx(hand.now - 9.0 - late.timestamp - GROWTH, abs=1e-6)
+    clock.take(late, transit_known=False)  # released: what may grow is what an arming measures
+    for k in range(100_000, 200_000):
+        hand.now = 10.0 + 0.002 * k * (1.0 + 5e-4)
+        clock.take(late := state(1.0 + 0.002 * k, hand.now))
+    assert clock.age(late) < 1e-3
 
 
 def test_a_clock_that_is_set_forward_behind_late_samples_makes_none_of_them_younger() -> None:

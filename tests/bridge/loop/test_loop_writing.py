@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
-from gapbridge.bridge.loop.writing import PARTIAL_WRITE_LIMIT, Writing
+from gapbridge.bridge.loop.writing import PARTIAL_WRITE_LIMIT, SETTLING_TIMEOUT, Writing
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import Correction
@@ -30,6 +31,7 @@ from gapbridge.core.errors import (
     ForeignCommandError,
     GateError,
     IneffectiveWriteError,
+    InputError,
     LateSetpointError,
     LinkError,
     PartialWriteError,
@@ -463,6 +465,28 @@ def test_faults_and_armings_in_turn_do_not_add_up(bench: Bench) -> None:
     assert shifts == pytest.approx([shifts[0]] * 4, rel=1e-3)
 
 
+def test_each_motion_has_its_own_time_to_settle(bench: Bench) -> None:
+    def settles(away: float) -> bool:
+        bench.supervisor.state = State.HOLDING
+        state = bench.state()
+        setpoint = bench.writing.write(state, bench.q, bench.loads.update(state))
+        assert setpoint is not None
+        assert bench.stream.at_rest
+        return bench.writing.at_rest(setpoint, state._replace(target_q=setpoint.q + away))
+
+    bench.supervisor.state = State.HOLDING
+    bench.cycles(2000)
+    assert not settles(1e-3)
+    bench.supervisor.state = State.FAULT
+    bench.writing.release()
+    CLOCK.sleep(2.0 * SETTLING_TIMEOUT)
+    bench.rearm()
+    bench.supervisor.state = State.HOLDING
+    bench.cycles(2000)
+    assert not settles(1e-3)  # the time of the motion before does not count
+    assert settles(0.0)
+
+
 def test_a_beginning_with_an_offset_in_force_makes_no_step(bench: Bench) -> None:
     bench.cycles(100)  # in the middle of the ramp
     bench.supervisor.take(Cause.SILENCE)
@@ -507,6 +531,29 @@ def test_an_offset_in_force_outlives_the_process_that_left_it(tmp_path: Path) ->
     kept.note(np.full(6, 0.4), np.zeros(6), np.zeros(6))
     assert kept.offset_at(np.full(6, 0.4)) is None
     assert OffsetInForce(7, path).offset_at(np.zeros(7)) is None  # another arm
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="the system reserves no space")
+def test_the_place_of_an_offset_in_force_is_reserved_or_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "arm.offset"
+    size = 8 * (1 + 2 * (2 * 6 + 6))
+    with path.open("wb") as hole:
+        hole.truncate(size)
+    kept = OffsetInForce(6, path)
+    assert path.stat().st_size == size
+    assert 512 * path.stat().st_blocks >= size
+    assert kept.offset_at(Q) is None
+
+    def is_full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", is_full)
+    with pytest.raises(InputError, match=r"arm\.offset: .* cannot be kept: No space left"):
+        OffsetInForce(6, path)
+    with pytest.raises(InputError, match="none/arm"):
+        OffsetInForce(6, tmp_path / "none" / "arm.offset")
 
 
 def test_a_clock_that_goes_back_withdraws_the_offset_step_by_step(bench: Bench) -> None:

@@ -59,19 +59,21 @@ class Wire:
         return Sample({"echo": applied, "position": q}, None, (), motion, (self.number, says))
 
 
-def made(name: str) -> tuple[Any, Wire, ByHand]:
+def made(name: str, together: bool = False) -> tuple[Any, Wire, ByHand]:
     """Return the writer of a shipped profile, its wire and its clock."""
     wire, clock = Wire(), ByHand()
     profile = read_profile(ModbusSettings.shipped / f"{name}.yaml")
-    if profile.function_23:
-        profile = profile.model_copy(update={"function_23": False})
+    profile = profile.model_copy(update={"function_23": together})
     writer = make_writer(profile, wire, lambda: (0.01, 0.02), 1.0, clock)  # type: ignore[arg-type]
     return writer, wire, clock
 
 
-def opened(name: str) -> tuple[Any, Wire, ByHand]:
-    """Return the armed writer of a shipped profile, its wire and its clock."""
-    writer, wire, clock = made(name)
+def opened(name: str, together: bool = False) -> tuple[Any, Wire, ByHand]:
+    """Return the armed writer of a shipped profile, its wire and its clock.
+
+    ``together``: it writes with the next reading.
+    """
+    writer, wire, clock = made(name, together)
 
     def look() -> Sample:
         if isinstance(writer, MailboxWriter) and wire.written:
@@ -100,6 +102,22 @@ def test_an_offset_that_does_not_come_back_ends_the_writing_in_time() -> None:
     assert reason
     assert "offsets do not arrive" in str(reason[0])
     assert allowed < clock.now - begun < allowed + 0.02
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_an_offset_that_waits_for_the_next_reading_never_leaves_after_its_expiry(
+    late: bool,
+) -> None:
+    writer, wire, clock = opened("ur", together=True)
+    before = len(wire.written)
+    for x in (1e-4, 0.0):  # the last one of a ramp would leave with the release
+        writer.write(offset(x), wire.sample(), clock.now + 0.02)
+        clock.now += 0.03 if late else 0.01
+        if x:
+            assert (writer.pending() is None) == late
+            assert writer.pending() is None  # once
+    writer.release()
+    assert len(wire.written) == before + (not late)
 
 
 def test_offsets_that_come_back_late_but_in_time_go_on() -> None:

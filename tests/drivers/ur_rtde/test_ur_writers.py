@@ -179,6 +179,15 @@ def test_the_robots_watchdog_is_fed_before_it_expires(servo: Servo, kept: bool) 
     assert np.diff(kicks).max() < (KICK + 2 * CYCLE if kept else 0.5 / SETTINGS.watchdog)
 
 
+@pytest.mark.parametrize("also", [set[str](), {"servoStop"}])
+def test_a_refused_watchdog_leaves_no_script_of_ours_running(also: set[str]) -> None:
+    servo = Servo()
+    servo.library.refused = {"setWatchdog", *also}
+    with pytest.raises(WriteError, match="refused the watchdog"):
+        servo.arm(state(runtime_state=STOPPED), lambda: None)
+    assert servo.library.calls[-1] == ("stopScript",)
+
+
 def test_a_running_program_is_not_ended_by_arming() -> None:
     servo = Servo()
     with pytest.raises(WriteError, match="found a program running"):
@@ -289,6 +298,23 @@ def test_offsets_need_the_robots_program(answer: tuple[int, int]) -> None:
     offset.note_answer(17, answer[0], offset.applied)
     with pytest.raises(WriteError, match="expected a running robot program"):
         offset.arm(state(runtime_state=answer[1]), offset.look)
+
+
+@pytest.mark.parametrize("sequence", [1, 499_999, 500_001, 750_000, registers.LAST_SEQUENCE])
+def test_an_echo_of_zero_reaches_no_number(sequence: int) -> None:
+    assert registers.reached(sequence, sequence)
+    assert registers.reached(registers.next_sequence(sequence), sequence)
+    assert not registers.reached(0, sequence)
+
+
+def test_no_offset_is_sent_to_a_program_that_is_gone(offset: Offset) -> None:
+    offset.write(setpoint(offset=[1e-3, 0, 0, 0, 0, 0]), state())
+    offset.library.calls.clear()
+    offset.note_answer(0, registers.Program.ABSENT, offset.applied)
+    assert offset.unanswered_since() == offset.clock.now  # nothing has come back
+    with pytest.raises(WriteError, match="the robot's program has ended"):
+        offset.write(setpoint(offset=[1e-3, 0, 0, 0, 0, 0]), state())
+    assert not offset.library.calls
 
 
 @pytest.mark.parametrize(("rate", "turn"), [(0.05, 0.1), (0.0499, 0.09999), (0.01, 0.02)])
