@@ -176,7 +176,7 @@ class RobotiqFt300(ForceTorqueSensor):
 
     def _ask(self) -> Reading | None:
         """Return the registers' sample; None if the answer is invalid."""
-        from pymodbus.exceptions import ConnectionException, ModbusException
+        from pymodbus.exceptions import ModbusException
 
         line = self._line()
         requested_at = self._now()
@@ -184,9 +184,11 @@ class RobotiqFt300(ForceTorqueSensor):
             answer = self._client.read_holding_registers(
                 REGISTER, count=6, device_id=self.settings.device_id
             )
-        except (ConnectionException, OSError) as error:
-            raise self._broken(error) from None
-        except ModbusException:
+        except (ModbusException, OSError) as error:
+            # a request that took too long to write leaves the port open
+            is_open = self._client is not None and self._client.socket is not None
+            if isinstance(error, OSError) or not is_open:
+                raise self._broken(error) from None
             self.dropped += 1
             with contextlib.suppress(OSError):
                 line.reset_input_buffer()

@@ -149,6 +149,26 @@ def test_a_sensor_that_does_not_answer_is_no_sensor() -> None:
         make_sensor(wire.settings(), SYSTEM).connect()
 
 
+def test_a_request_that_takes_too_long_to_write_is_one_missing_sample(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """pyserial's timeout leaves the port open; the library reports it as a broken connection."""
+    wire = make_wire("robotiq_ft300 registers", Reaction())
+    with wire.device, make_sensor(wire.settings(), SYSTEM) as made:
+        sensor: Any = made
+        next_reading(sensor)
+
+        def too_late(_: bytes) -> int:
+            raise serial.SerialTimeoutException("Write timeout")
+
+        with monkeypatch.context() as stalled:
+            stalled.setattr(sensor._client.socket, "write", too_late)
+            dropped = sensor.dropped
+            assert sensor.read(0.2) is None
+            assert sensor.dropped == dropped + 1
+        assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.1)
+
+
 @pytest.mark.parametrize("kind", ["robotous_rft", "robotiq_ft300"])
 def test_close_ends_the_stream(kind: str) -> None:
     wire = make_wire(kind, Reaction())
