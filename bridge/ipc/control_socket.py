@@ -83,7 +83,11 @@ class ControlSocket:
             if not self._slots.acquire(blocking=False):
                 connection.close()
                 continue
-            threading.Thread(target=self._handle, args=(connection,), daemon=True).start()
+            try:
+                threading.Thread(target=self._handle, args=(connection,), daemon=True).start()
+            except RuntimeError:  # no thread can be started: the client sees the connection end
+                connection.close()
+                self._slots.release()
 
     def _handle(self, connection: socket.socket) -> None:
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -19,6 +20,7 @@ from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import STOP_TIMEOUT, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_ramp_out
+from gapbridge.core.errors import LinkError
 from gapbridge.drivers.clock import Clock
 
 CELL = """robot: {model: ur10e}
@@ -52,6 +54,7 @@ class Played(LoopProcess):
     """A loop that reads states and ends when it is to stop, unless it is ``deaf``.
 
     ``silent``: its heart stands still. ``dies``: the exit code with which it dies at 0.5 s.
+    ``ramps``: s that it takes to stop.
     """
 
     pid = 1
@@ -65,6 +68,7 @@ class Played(LoopProcess):
         self.how, self.order, self._clock = how, order, clock
         self._now, self.started = clock.monotonic, clock.monotonic()
         self.killed_at: float | None = None
+        self.asked_at: float | None = None  # to stop
         self.own = SharedMemory(memory.n, memory.fd, clock=clock)
         self.own.enter(Phase.RUNNING)
         self.own.note_state_read()
@@ -77,8 +81,11 @@ class Played(LoopProcess):
             return -9
         if "dies" in self.how and self._clock.now > 0.5:
             return int(self.how["dies"])
-        stops = self._commands.last_of(Command.STOP) and "deaf" not in self.how
-        return Exit.DONE if stops else None
+        if self.asked_at is None and self._commands.last_of(Command.STOP):
+            self.asked_at = self._clock.now
+        if self.asked_at is None or "deaf" in self.how:
+            return None
+        return Exit.DONE if self._clock.now >= self.asked_at + self.how.get("ramps", 0.0) else None
 
     def events(self) -> list[dict[str, Any]]:
         return []
@@ -86,7 +93,9 @@ class Played(LoopProcess):
     def kill(self) -> None:
         self.killed_at = self._clock.now
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        if self.exit_code is None:
+            self.kill()
 
 
 class Bench(Daemon):
@@ -100,7 +109,10 @@ class Bench(Daemon):
         todo = iter(how)
 
         def make(*given: Any) -> Played:
-            self.loops.append(Played(next(todo, {}), *given))
+            told = next(todo, {})
+            if "refused" in told:
+                raise OSError(errno.EAGAIN, "no process is left")
+            self.loops.append(Played(told, *given))
             return self.loops[-1]
 
         self.loop_process = make  # type: ignore[assignment]
@@ -180,3 +192,39 @@ def test_loops_that_die_are_started_again_more_and_more_slowly(tmp_path: Path) -
     expected = [min(2.0**k * first, most) for k in range(1, len(begun))]
     assert waits == pytest.approx(expected, abs=4 * TICK)
     assert len(waits) > 2
+
+
+def test_a_loop_that_cannot_be_started_counts_as_one_that_ended(tmp_path: Path) -> None:
+    daemon = Bench(tmp_path, {"dies": Exit.CRASH}, {"refused": True}, {"refused": True})
+    summary = daemon.run_until(5.0, arm=True)
+    detail = "the loop's process cannot be started: no process is left"
+    assert summary.faults[1:] == (detail, detail)
+    assert summary.restarts == 3
+    first, second = daemon.loops
+    assert second.order["after"] >= daemon.asked[Command.ARM] > first.order["after"]
+    assert second.started - first.started > 0.5 + 7 * daemon.settings.backoff[0]  # 1 + 2 + 4
+
+
+def test_a_first_loop_that_cannot_be_started_ends_the_run(tmp_path: Path) -> None:
+    with pytest.raises(LinkError, match="cannot be started"):
+        Bench(tmp_path, {"refused": True}).run_until(5.0)
+
+
+def fails() -> None:
+    raise ZeroDivisionError
+
+
+@pytest.mark.parametrize("how", [{"ramps": 0.7}, {"deaf": True}])
+def test_a_daemon_that_fails_has_its_loop_ramp_out(tmp_path: Path, how: dict[str, Any]) -> None:
+    daemon = Bench(tmp_path, how)
+    daemon.clock.acts[1.0] = fails
+    with pytest.raises(ZeroDivisionError):
+        daemon.run_until(30.0)
+    (loop,) = daemon.loops
+    assert daemon.asked[Command.STOP]
+    if "deaf" not in how:
+        assert loop.killed_at is None
+        return
+    assert loop.killed_at is not None
+    own = STOP_TIMEOUT + longest_ramp_out(daemon.settings.limits)  # the loop's deadline
+    assert own < loop.killed_at - 1.0 < own + STOP_MARGIN + 5 * TICK
