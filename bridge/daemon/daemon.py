@@ -262,6 +262,7 @@ class Daemon:
                     self.restarts += 1
             self._read_loop()
             summary = self._summary()
+            self._note_end()
         return replace(summary, lost_rows=self.lost_rows)  # the recorder has finished since
 
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
@@ -281,7 +282,7 @@ class Daemon:
         if folder is not None:
             log = folder / f"{self.session}{LOOP_LOG}"
             self._output = stack.enter_context(open(log, "ab", opener=private))  # noqa: SIM115
-        stack.callback(self._close_side_processes)
+        stack.callback(self.side_processes.close, self.event_log.add)
         self.side_processes.start(self.configuration, self.session, self.memory, self._output)
         stack.callback(lambda: self.event_log.add({"kind": EventKind.ENDED}))
         self._zeros.open()
@@ -290,10 +291,6 @@ class Daemon:
         for where in places(settings):
             self.event_log.add({"kind": EventKind.NOTE, "detail": where})
         return self._take_over(lock, arm, by)
-
-    def _close_side_processes(self) -> None:
-        for event in self.side_processes.close():
-            self.event_log.add(event)
 
     def _take_over(self, lock: OwnerLock, arm: bool, by: str) -> bool:
         """Go on from how the last run ended; returns whether the first loop may arm by itself."""
@@ -310,6 +307,12 @@ class Daemon:
         """Have the lock's note say what is latched, for a daemon after this one has died."""
         if self._lock is not None:
             self._lock.note_latched(self._status.lasting)
+
+    def _note_end(self) -> None:
+        """Have the lock say whether the next daemon may arm by itself."""
+        cut_off = self.memory.ended and self.state == State.DISCONNECTED  # it would begin again
+        if self._lock is not None:
+            self._lock.note_end(self.state != State.FAULT and not (self._status.lasting or cut_off))
 
     def _pause(self) -> None:
         """Wait before the next process of the loop; the side processes are served meanwhile."""
@@ -349,7 +352,6 @@ class Daemon:
             self._on_loop_end(None, f"the loop's process cannot be started: {error.strerror}")
             return
         stop_by = first_cycle = None
-        needed = 0.0  # s from a request to stop until the loop is killed
         try:
             while loop.exit_code is None:
                 self._clock.sleep(TICK)
@@ -365,8 +367,7 @@ class Daemon:
                 if self._reload.step(self.state, self.phase, self.configuration):
                     self._commands.ask(Command.RAMP_OUT)  # not a person's request
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
-                    needed = self._longest_stop
-                    stop_by = self._clock.monotonic() + needed
+                    stop_by = self._clock.monotonic() + self._longest_stop
                     if self._stopping.is_set():
                         self.manager.stopping()
                     loop.ask_to_stop()
@@ -374,7 +375,7 @@ class Daemon:
                 if loop.hangs:
                     detail = f"no heartbeat of the loop for {self.memory.silence:.2f} s: killed"
                 elif stop_by is not None and self._clock.monotonic() > stop_by:
-                    detail = f"the loop has not stopped within {needed:.1f} s: killed"
+                    detail = f"the loop has not stopped within {self._longest_stop:.1f} s: killed"
                 if detail:
                     loop.kill()  # reported after its end: nothing is written any more
                     self._fault("hang", detail)

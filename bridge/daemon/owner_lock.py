@@ -25,9 +25,9 @@ class OwnerLock:
     ``before``: the note of the last owner, empty if it ended normally. What is latched is noted
     from the beginning, so that it also outlives an owner that dies at once. A power failure
     empties the folder of the lock, so that there is a mark of a run in the state folder, too;
-    ``problem`` says why there is none. As a context manager: an exception leaves note and mark,
-    except InputError and LinkError of a run that was refused at its start: for the next owner it
-    is as if there had been none.
+    ``problem`` says why there is none. As a context manager: an exception leaves note and mark, as
+    an end does that ``note_end`` says was not in order. After InputError and LinkError, which
+    refuse a run at its start, it is for the next owner as if there had been none.
     """
 
     def __init__(self, address: str, cell: Path) -> None:
@@ -39,6 +39,7 @@ class OwnerLock:
         self.before: dict[str, Any] = {}
         self.problem = ""
         self._latched = ""  # as the note has it
+        self._in_order = True  # so the run ends: the next owner may arm by itself
 
     def acquire(self) -> None:
         """Take the lock. Raises InputError if another daemon has it."""
@@ -92,6 +93,10 @@ class OwnerLock:
         if latched != self._latched:
             self._latched = latched
             self.note({"latched": latched} if latched else {})
+
+    def note_end(self, in_order: bool) -> None:
+        """Note how the run ends; ``in_order``: so that the next owner may arm by itself."""
+        self._in_order = in_order
 
     def _mark(self) -> bool:
         """Mark that a run has begun; returns whether there is a mark already.
@@ -149,7 +154,7 @@ class OwnerLock:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         refused = kind is not None and issubclass(kind, (InputError, LinkError))
-        if kind is not None and not refused:
+        if not (self._in_order if kind is None else refused):
             self._let_go()
         elif refused and self.before:
             self._write(json.dumps(self.before) + "\n")

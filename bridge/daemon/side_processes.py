@@ -76,10 +76,10 @@ class SideProcesses:
             for name, side in self._running.items()
         }  # fmt: skip
 
-    def close(self) -> list[dict[str, Any]]:
+    def close(self, emit: Callable[[dict[str, Any]], object]) -> None:
         """Notify all that the daemon ends, and wait until they have finished.
 
-        Returns their last events, and one on each that had something to finish and did not.
+        Then emits their last events, and one on each that had something to finish and did not.
         """
         events = []
         for side in self._running.values():
@@ -90,7 +90,8 @@ class SideProcesses:
             if problem is not None and name in END_TIMEOUTS:
                 events.append({"kind": EventKind.SIDE, "side": name, "detail": problem})
         self._running.clear()
-        return events
+        for event in events:
+            emit(event)
 
 
 def _checked(name: str, event: dict[str, Any]) -> dict[str, Any]:

@@ -14,12 +14,15 @@ import pytest
 
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.daemon.daemon import STOP_MARGIN, TICK, Daemon
+from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import STOP_TIMEOUT, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_ramp_out
+from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.clock import Clock
 
@@ -54,7 +57,8 @@ class Played(LoopProcess):
     """A loop that reads states and ends when it is to stop, unless it is ``deaf``.
 
     ``silent``: its heart stands still. ``dies``: the exit code with which it dies at 0.5 s.
-    ``ramps``: s that it takes to stop.
+    ``ramps``: s that it takes to stop. ``ends``: s at which its trajectory does; ``tells``:
+    its state and the event of how it came there.
     """
 
     pid = 1
@@ -72,6 +76,8 @@ class Played(LoopProcess):
         self.own = SharedMemory(memory.n, memory.fd, clock=clock)
         self.own.enter(Phase.RUNNING)
         self.own.note_state_read()
+        self._news = [how["tells"]] if "tells" in how else []
+        self.own.note_state(State[how["tells"]["to"]] if "tells" in how else State.OBSERVING)
 
     @property
     def exit_code(self) -> int | None:
@@ -79,6 +85,8 @@ class Played(LoopProcess):
             self.own.beat()
         if self.killed_at is not None:
             return -9
+        if "ends" in self.how and self._clock.now > self.how["ends"]:
+            self.own.note_ended()
         if "dies" in self.how and self._clock.now > 0.5:
             return int(self.how["dies"])
         if self.asked_at is None and self._commands.last_of(Command.STOP):
@@ -88,7 +96,8 @@ class Played(LoopProcess):
         return Exit.DONE if self._clock.now >= self.asked_at + self.how.get("ramps", 0.0) else None
 
     def events(self) -> list[dict[str, Any]]:
-        return []
+        news, self._news = self._news, []
+        return news
 
     def kill(self) -> None:
         self.killed_at = self._clock.now
@@ -99,7 +108,9 @@ class Played(LoopProcess):
 
 
 class Bench(Daemon):
-    """A daemon without locks, sockets and side processes; each loop of it does as it is told."""
+    """A daemon without sockets and side processes; each loop of it does as it is told."""
+
+    locked = False  # it owns its controller
 
     def __init__(self, folder: Path, *how: dict[str, Any], may_write: bool = True) -> None:
         cell = folder / "cell.yaml"
@@ -118,7 +129,11 @@ class Bench(Daemon):
         self.loop_process = make  # type: ignore[assignment]
 
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
-        return arm
+        if not self.locked:
+            return arm
+        return self._take_over(
+            stack.enter_context(OwnerLock("host 192.0.2.7", self.settings.cell)), arm, by
+        )
 
     def run_until(self, seconds: float, arm: bool = False) -> RunSummary:
         """Run, and ask to stop after so many seconds."""
@@ -208,6 +223,52 @@ def test_a_loop_that_cannot_be_started_counts_as_one_that_ended(tmp_path: Path) 
 def test_a_first_loop_that_cannot_be_started_ends_the_run(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match="cannot be started"):
         Bench(tmp_path, {"refused": True}).run_until(5.0)
+
+
+def fault(to: State, cause: Cause) -> dict[str, Any]:
+    return {
+        "kind": "transition", "from": "HOLDING", "to": to.name, "cause": cause, "detail": "",
+        "time": 100.0, "monotonic": 100.0,
+    }  # fmt: skip
+
+
+class Owner(Bench):
+    """One that owns its controller, and whose cell file says that it arms."""
+
+    locked = True
+
+    def run_as_a_service(self, seconds: float) -> RunSummary:
+        """Run; returns how it went."""
+        self.clock.acts[seconds] = self.stop
+        try:
+            return self.run(arm=True, by="the cell file")
+        finally:
+            self.armed = bool(self._commands.last_of(Command.ARM))
+            self._commands.close()
+            self.memory.close()
+
+
+@pytest.mark.parametrize(
+    ("how", "arms", "latched"),
+    [
+        ({}, True, ""),
+        ({"tells": fault(State.FAULT, Cause.UNSAFE)}, False, Cause.UNSAFE),
+        ({"tells": fault(State.FAULT, Cause.SILENCE)}, False, ""),  # ends with that link
+        ({"ends": 0.4, "ramps": 1.0, "dies": Exit.LINK}, False, ""),  # in the last ramp
+    ],
+)
+def test_what_has_not_ended_in_order_does_not_begin_again_by_itself(
+    runtime: Path, tmp_path: Path, how: dict[str, Any], arms: bool, latched: str
+) -> None:
+    first, second = Owner(tmp_path, how), Owner(tmp_path)
+    first.run_as_a_service(2.0)
+    assert first.armed
+    second.run_as_a_service(2.0)
+    assert second.armed == arms
+    assert second.loops[0].order["latched"] == latched
+    third = Owner(tmp_path)
+    third.run_as_a_service(2.0)  # the second ended in order, unless it has the fault
+    assert third.armed == (not latched)
 
 
 def fails() -> None:
