@@ -16,6 +16,7 @@ import termios
 from contextlib import ExitStack
 from typing import IO, Any
 
+from gapbridge.bridge.ipc.sealed_memory import sealed_bytes
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import EventLines, EventWriter
 from gapbridge.drivers.clock import Clock
@@ -163,11 +164,18 @@ class SideProcess:
             ours.enter_context(successors)
             passed.enter_context(remote)
             fds = (down_read, up_write, memory, remote.fileno())
+            start_data = {
+                **self.start_data, "memory": memory, "events": down_read, "up": up_write,
+                "successors": fds[3],
+            }  # fmt: skip
+            # memory, not a pipe: however much it is, nobody waits until it has been read
+            text = (json.dumps(start_data) + "\n").encode()
+            stdin = held(passed, sealed_bytes("gapbridge-start", text))
             # spawned, not forked; in a new session, so that Ctrl-C reaches only the daemon, which
             # then ends it
             process = subprocess.Popen(
                 [sys.executable, "-X", "faulthandler", "-m", self.module],
-                stdin=subprocess.PIPE, stdout=self._log, stderr=self._log, env=environment(),
+                stdin=stdin, stdout=self._log, stderr=self._log, env=environment(),
                 pass_fds=fds, start_new_session=True,
             )  # fmt: skip
             ours.pop_all()
@@ -177,14 +185,6 @@ class SideProcess:
         self._down, self._up = EventWriter(down_write), EventLines(up_read)
         self._started = self._read_at = self._now()
         self._has_read = False
-        start_data = {
-            **self.start_data, "memory": memory, "events": down_read, "up": up_write,
-            "successors": fds[3],
-        }  # fmt: skip
-        assert process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has ended, which check() detects
-            process.stdin.write((json.dumps(start_data) + "\n").encode())
-            process.stdin.close()
 
     def _check_reading(self, now: float) -> str | None:
         """Kill it if it has not emptied its pipe for too long."""
