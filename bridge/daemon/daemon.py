@@ -93,10 +93,10 @@ class Daemon:
         self._fitted = FittedWatch(configuration.fitted, self.memory.slices)
         self._zeros = ZeroWatch(
             configuration, self.memory.slices, self._status, self.event_log.add,
-            self._commands.ask, clock,
+            self._commands, clock,
         )  # fmt: skip
         self._requests = Requests(
-            self._commands, self.event_log.add, lambda: self._status.zero_moved,
+            self._commands, self.event_log.add, lambda: self._status.unacknowledged,
             self._zeros.obstacle_to,
         )  # fmt: skip
         self._status_at = 0.0
@@ -237,8 +237,8 @@ class Daemon:
     def disarm(self, by: str = PROGRAM) -> int:
         """Request ramping out and observing, from this loop or the next; acknowledge a fault.
 
-        A fault that occurs after this call is not acknowledged. Returns the request's number: the
-        loop has received it once ``last_taken`` reaches it.
+        What occurs after this call is not acknowledged. Returns the request's number: the loop has
+        received it once ``last_taken`` reaches it.
         """
         return self._requests.make(Command.DISARM if self.latched else Command.RAMP_OUT, by)
 
