@@ -57,7 +57,7 @@ def test_a_folder_that_does_not_answer_keeps_the_daemon_not_waiting(
 
     def hangs(_: Path) -> Configuration:
         readings.append(threading.current_thread().name)
-        answers.wait()
+        answers.wait(10.0)
         return taking.running
 
     monkeypatch.setattr(reload, "read_configuration", hangs)
