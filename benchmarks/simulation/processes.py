@@ -20,6 +20,7 @@ from gapbridge.bridge.daemon import reload
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
+from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.daemon.verification_watch import VerificationWatch
 from gapbridge.bridge.ipc.command_memory import CommandMemory, Commands
@@ -186,6 +187,7 @@ class SimulatedDaemon(Daemon):
         self._run = run
         super().__init__(configuration, may_write=True, clock=run.clock)
         self.loop_process = lambda *given: SimulatedLoop(run, *given)  # type: ignore[assignment]
+        self._reload = Reload(self.manager, self.event_log, in_thread=False)
         self._zeros.verification = VerificationWatch(self.settings.cell, self.longest_wait)
 
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Protocol
 
-from gapbridge.bridge.ipc.control_socket import Peer, refusal
+from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
+from gapbridge.bridge.ipc.control_socket import ControlSocket, Peer, refusal
 from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import Cause
+from gapbridge.core.errors import InputError
 from gapbridge.drivers.clock import Clock
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
@@ -76,6 +80,21 @@ class Control:
 
     def __init__(self, daemon: Controlled, clock: Clock) -> None:
         self._daemon, self._clock = daemon, clock
+
+    @contextmanager
+    def socket(self, cell: Path) -> Iterator[None]:
+        """Answer at a cell's socket while the ``with`` block lasts. Raises InputError."""
+        path = runtime_folder() / f"{cell_key(cell)}.sock"
+        listener = ControlSocket(path, self.answer, self._clock)
+        try:
+            listener.open()
+        except OSError as error:
+            detail = f"{listener.path}: {error.strerror}, expected a socket to listen on"
+            raise InputError(detail) from None
+        try:
+            yield
+        finally:
+            listener.close()
 
     def answer(self, command: str, peer: Peer) -> dict[str, Any]:
         """Return the answer to a command of COMMANDS."""

@@ -19,22 +19,20 @@ from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.run_settings import Configuration, configuration_for
-from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.fitted_watch import FittedWatch
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
-from gapbridge.bridge.daemon.processes import LoopProcess
+from gapbridge.bridge.daemon.processes import LoopProcess, ramp_out
 from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.requests import Requests
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.daemon.side_processes import SideProcesses
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
-from gapbridge.bridge.daemon.summary import RunSummary, Tally
+from gapbridge.bridge.daemon.summary import RunSummary, Tally, places
 from gapbridge.bridge.daemon.zero_watch import ZeroWatch
 from gapbridge.bridge.document.output_file import private, require_folder
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
-from gapbridge.bridge.ipc.control_socket import ControlSocket
 from gapbridge.bridge.ipc.events import Event, EventKind, EventLog
 from gapbridge.bridge.ipc.loop_counters import DROPPED
 from gapbridge.bridge.ipc.loop_state import State
@@ -95,10 +93,10 @@ class Daemon:
         self._fitted = FittedWatch(configuration.fitted, self.memory.slices)
         self._zeros = ZeroWatch(
             configuration, self.memory.slices, self._status, self.event_log.add,
-            self._commands.ask, clock,
+            self._commands, clock,
         )  # fmt: skip
         self._requests = Requests(
-            self._commands, self.event_log.add, lambda: self._status.zero_moved,
+            self._commands, self.event_log.add, lambda: self._status.unacknowledged,
             self._zeros.obstacle_to,
         )  # fmt: skip
         self._status_at = 0.0
@@ -117,7 +115,6 @@ class Daemon:
         self._last_state = State.DISCONNECTED
         self._stopping = threading.Event()
         self._lock: OwnerLock | None = None
-        self._noted = ""  # what is latched, as the lock's note has it
 
     # -- status and requests ----------------------------------------------------------------------
 
@@ -240,8 +237,8 @@ class Daemon:
     def disarm(self, by: str = PROGRAM) -> int:
         """Request ramping out and observing, from this loop or the next; acknowledge a fault.
 
-        A fault that occurs after this call is not acknowledged. Returns the request's number: the
-        loop has received it once ``last_taken`` reaches it.
+        What occurs after this call is not acknowledged. Returns the request's number: the loop has
+        received it once ``last_taken`` reaches it.
         """
         return self._requests.make(Command.DISARM if self.latched else Command.RAMP_OUT, by)
 
@@ -265,6 +262,7 @@ class Daemon:
                     self.restarts += 1
             self._read_loop()
             summary = self._summary()
+            self._note_end()
         return replace(summary, lost_rows=self.lost_rows)  # the recorder has finished since
 
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
@@ -284,36 +282,20 @@ class Daemon:
         if folder is not None:
             log = folder / f"{self.session}{LOOP_LOG}"
             self._output = stack.enter_context(open(log, "ab", opener=private))  # noqa: SIM115
-        start_data = {
-            "settings": settings.model_dump(mode="json"), "n": self.configuration.n,
-            "session": self.session, "extra": {"text": self.configuration.text},
-        }  # fmt: skip
-        stack.callback(self._close_side_processes)
-        self.side_processes.start(settings, start_data, self.memory, self._output)
+        stack.callback(self.side_processes.close, self.event_log.add)
+        self.side_processes.start(self.configuration, self.session, self.memory, self._output)
         stack.callback(lambda: self.event_log.add({"kind": EventKind.ENDED}))
         self._zeros.open()
         stack.callback(self._zeros.close)
-        path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
-        try:
-            stack.enter_context(ControlSocket(path, self.control.answer, self._clock))
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror}, expected a socket to listen on") from None
-        if settings.web is not None:
-            where = f"status page: {settings.web.url}"
-            self.event_log.add({"kind": EventKind.NOTE, "detail": where})
-        if settings.setpoints.source == "planner":
-            where = f"setpoints: a planner writes to {settings.setpoints.socket}"
+        stack.enter_context(self.control.socket(settings.cell))
+        for where in places(settings):
             self.event_log.add({"kind": EventKind.NOTE, "detail": where})
         return self._take_over(lock, arm, by)
 
-    def _close_side_processes(self) -> None:
-        for event in self.side_processes.close():
-            self.event_log.add(event)
-
     def _take_over(self, lock: OwnerLock, arm: bool, by: str) -> bool:
         """Go on from how the last run ended; returns whether the first loop may arm by itself."""
-        self._lock, self._noted = lock, str(lock.before.get("latched", ""))
-        self._status.restore(self._noted)
+        self._lock = lock
+        self._status.restore(str(lock.before.get("latched", "")))
         # after a crash --arm from a terminal may arm, a restarted service may not
         if arm and lock.disorder and (by != "--arm" or self.manager.present):
             detail = f"{lock.disorder}: not arming by itself; gapbridge arm"
@@ -323,10 +305,14 @@ class Daemon:
 
     def _note_latched(self) -> None:
         """Have the lock's note say what is latched, for a daemon after this one has died."""
-        latched = self._status.lasting
-        if self._lock is not None and latched != self._noted:
-            self._noted = latched
-            self._lock.note({"latched": latched} if latched else {})
+        if self._lock is not None:
+            self._lock.note_latched(self._status.lasting)
+
+    def _note_end(self) -> None:
+        """Have the lock say whether the next daemon may arm by itself."""
+        cut_off = self.memory.ended and self.state == State.DISCONNECTED  # it would begin again
+        if self._lock is not None:
+            self._lock.note_end(self.state != State.FAULT and not (self._status.lasting or cut_off))
 
     def _pause(self) -> None:
         """Wait before the next process of the loop; the side processes are served meanwhile."""
@@ -360,9 +346,12 @@ class Daemon:
         """Run one process of the loop to its end; ``armed_by``: who lets it arm at its start."""
         self._last_state = State.DISCONNECTED
         self._failure = {}
-        loop = self.loop = self._start_loop(armed_by)
+        try:
+            loop = self.loop = self._start_loop(armed_by)
+        except OSError as error:  # memory, processes or descriptors are short
+            self._on_loop_end(None, f"the loop's process cannot be started: {error.strerror}")
+            return
         stop_by = first_cycle = None
-        needed = 0.0  # s from a request to stop until the loop is killed
         try:
             while loop.exit_code is None:
                 self._clock.sleep(TICK)
@@ -378,8 +367,7 @@ class Daemon:
                 if self._reload.step(self.state, self.phase, self.configuration):
                     self._commands.ask(Command.RAMP_OUT)  # not a person's request
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
-                    needed = STOP_TIMEOUT + longest_ramp_out(self.settings.limits) + STOP_MARGIN
-                    stop_by = self._clock.monotonic() + needed
+                    stop_by = self._clock.monotonic() + self._longest_stop
                     if self._stopping.is_set():
                         self.manager.stopping()
                     loop.ask_to_stop()
@@ -387,22 +375,31 @@ class Daemon:
                 if loop.hangs:
                     detail = f"no heartbeat of the loop for {self.memory.silence:.2f} s: killed"
                 elif stop_by is not None and self._clock.monotonic() > stop_by:
-                    detail = f"the loop has not stopped within {needed:.1f} s: killed"
+                    detail = f"the loop has not stopped within {self._longest_stop:.1f} s: killed"
                 if detail:
                     loop.kill()  # reported after its end: nothing is written any more
                     self._fault("hang", detail)
             self._read_loop()
-            self._on_loop_end(loop)
+            self._on_loop_end(loop.exit_code, f"the loop's process {loop.describe_end()}")
             if first_cycle is not None and self._clock.monotonic() - first_cycle > HEALTHY:
                 self._wait = self.settings.backoff[0]
+        except Exception:  # of the daemon itself: the arm is not left where it is
+            ramp_out(loop, self._longest_stop, self.manager.kick, self._clock)
+            raise
         finally:
             self.loop = None
             loop.close()
 
+    @property
+    def _longest_stop(self) -> float:
+        """Return s from a request to stop until the loop is killed."""
+        return STOP_TIMEOUT + longest_ramp_out(self.settings.limits) + STOP_MARGIN
+
     def _start_loop(self, armed_by: str) -> LoopProcess:
         """Start a process of the loop, which receives only requests made from now on.
 
-        In addition, requests other than to arm that no loop has received are repeated.
+        In addition, requests other than to arm that no loop has received are repeated. Raises
+        OSError if no process can be started.
         """
         after = self._requests.forward_all()
         order = {
@@ -460,16 +457,18 @@ class Daemon:
         elif detail and kind not in NOT_SHOWN:
             self._say(detail)
 
-    def _on_loop_end(self, loop: LoopProcess) -> None:
-        """Act on the end of the loop's process; raises if a restart is useless."""
-        code = loop.exit_code
+    def _on_loop_end(self, code: int | None, how: str) -> None:
+        """Act on the end of the loop's process; raises if a restart is useless.
+
+        ``code``: its exit code, None if it could not be started. ``how`` it ended, as text.
+        """
         if code == Exit.DONE:
             if not self._reload.wants_end:
                 self._stopping.set()
             return
         self._last_state = State.DISCONNECTED
         self._status.lost_loop()
-        detail = str(self._failure.get("detail", "")) or f"the loop's process {loop.describe_end()}"
+        detail = str(self._failure.get("detail", "")) or how
         if self._stopping.is_set() and not self._failure:
             return
         if code == Exit.INPUT and not self._has_state:

@@ -91,7 +91,10 @@ class KeptRests:
         text = self._document(watch, configuration)
         if text != self._text:
             self._text = text
-            self._writing = self._writer.submit(write_text, self._path, text)
+            try:
+                self._writing = self._writer.submit(write_text, self._path, text)
+            except RuntimeError:  # no thread can be started
+                self._text = ""  # tried again
         return self._problem()
 
     def close(self) -> None:

@@ -14,10 +14,9 @@ from typing import Any, Self
 
 from gapbridge.bridge.cell.runtime_folder import runtime_folder, state_folder
 from gapbridge.bridge.document.output_file import sync_folder, write_text
-from gapbridge.core.errors import InputError, RunError
+from gapbridge.core.errors import InputError, LinkError, RunError
 
 LONGEST = 65536  # bytes of a note
-KEPT = ("latched",)  # of the last owner's note, until the new owner says otherwise
 
 
 class OwnerLock:
@@ -26,7 +25,9 @@ class OwnerLock:
     ``before``: the note of the last owner, empty if it ended normally. What is latched is noted
     from the beginning, so that it also outlives an owner that dies at once. A power failure
     empties the folder of the lock, so that there is a mark of a run in the state folder, too;
-    ``problem`` says why there is none.
+    ``problem`` says why there is none. As a context manager: an exception leaves note and mark, as
+    an end does that ``note_end`` says was not in order. After InputError and LinkError, which
+    refuse a run at its start, it is for the next owner as if there had been none.
     """
 
     def __init__(self, address: str, cell: Path) -> None:
@@ -37,6 +38,8 @@ class OwnerLock:
         self._key = hashlib.sha256(address.encode()).hexdigest()[:16]
         self.before: dict[str, Any] = {}
         self.problem = ""
+        self._latched = ""  # as the note has it
+        self._in_order = True  # so the run ends: the next owner may arm by itself
 
     def acquire(self) -> None:
         """Take the lock. Raises InputError if another daemon has it."""
@@ -57,14 +60,18 @@ class OwnerLock:
         self._take_over(os.pread(fd, LONGEST, 0))
 
     def _take_over(self, text: bytes) -> None:
-        """Take the last owner's note, and replace it by one of this owner."""
+        """Take the last owner's note, and replace it by one of this owner.
+
+        What was latched is kept until this owner says otherwise.
+        """
         self.before = _parsed(text)
         try:
             if self._mark() and not self.before:  # the power failed, or /run was emptied
                 self.before = {"cell": str(self._cell)}
         except (InputError, RunError) as error:
             self.problem = str(error)
-        self.note({key: self.before[key] for key in KEPT if key in self.before})
+        self._latched = str(self.before.get("latched", ""))
+        self.note({"latched": self._latched} if self._latched else {})
 
     def _claim_name(self) -> None:
         """Bind a socket name that is visible to all users, whose folders differ."""
@@ -80,6 +87,16 @@ class OwnerLock:
         """Store a note for the next owner, which ``release`` deletes."""
         note = {"pid": os.getpid(), "cell": str(self._cell), **fields}
         self._write(json.dumps(note) + "\n")
+
+    def note_latched(self, latched: str) -> None:
+        """Have the note say what is latched; empty: nothing."""
+        if latched != self._latched:
+            self._latched = latched
+            self.note({"latched": latched} if latched else {})
+
+    def note_end(self, in_order: bool) -> None:
+        """Note how the run ends; ``in_order``: so that the next owner may arm by itself."""
+        self._in_order = in_order
 
     def _mark(self) -> bool:
         """Mark that a run has begun; returns whether there is a mark already.
@@ -120,6 +137,10 @@ class OwnerLock:
         self._write("")
         with contextlib.suppress(OSError, InputError):  # else the next run does not arm by itself
             self._remove_mark()
+        self._let_go()
+
+    def _let_go(self) -> None:
+        """Release the lock; note and mark stay, as after a crash."""
         if self._fd is not None:
             os.close(self._fd)
             self._fd = None
@@ -131,8 +152,15 @@ class OwnerLock:
         self.acquire()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.release()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        refused = kind is not None and issubclass(kind, (InputError, LinkError))
+        if not (self._in_order if kind is None else refused):
+            self._let_go()
+        elif refused and self.before:
+            self._write(json.dumps(self.before) + "\n")
+            self._let_go()
+        else:
+            self.release()
 
 
 def _read(fd: int) -> dict[str, Any]:

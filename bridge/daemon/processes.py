@@ -10,6 +10,8 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import ExitStack
 from typing import IO, Any
 
 from gapbridge.bridge.cell.run_settings import Configuration
@@ -22,6 +24,7 @@ from gapbridge.drivers.clock import Clock
 
 STARTING_LIMIT = 180.0  # s: imports and, the first time, compilation
 ENDING_LIMIT = 2.0  # s
+LOOK_EVERY = 0.02  # s
 _LONGEST_EVENT = 65536  # bytes
 
 
@@ -30,7 +33,8 @@ class LoopProcess:
 
     It gets the files of its configuration as the daemon has read them, and reads no others.
     ``order`` holds ``may_write``, ``number`` (of the process, from 0), ``latched`` and ``after``
-    (number of the last request that is not for it); see bridge/loop/main.py.
+    (number of the last request that is not for it); see bridge/loop/main.py. Raises OSError if no
+    process can be started.
     """
 
     def __init__(
@@ -41,20 +45,16 @@ class LoopProcess:
         memory.renew()
         self.memory, self._commands = memory, commands
         self._settings = settings = configuration.settings
-        files = sealed_bytes("gapbridge-files", pickle.dumps(dict(configuration.files)))
-        # sockets, not pipes: they cannot be opened again through /proc
-        events, remote = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        orders, stdin = socket.socketpair()
-        self._events = events
-        events.setblocking(False)
         self.started = self._now()
-        order = {
-            **order, "settings": settings.model_dump(mode="json"), "n": memory.n,
-            "memory": memory.fd, "commands": commands.fd, "events": remote.fileno(),
-            "files": files, "hash": configuration.hash,
-            "parent": os.getpid(),
-        }  # fmt: skip
-        try:
+        with ExitStack() as stack:
+            files = sealed_bytes("gapbridge-files", pickle.dumps(dict(configuration.files)))
+            stack.callback(os.close, files)
+            # sockets, not pipes: they cannot be opened again through /proc
+            events, remote = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            stack.enter_context(remote)
+            kept = stack.enter_context(ExitStack())  # closed only where no process is started
+            kept.enter_context(events)
+            orders, stdin = map(stack.enter_context, socket.socketpair())
             # spawned, not forked: no threads and locks are inherited; in a new session, so that
             # Ctrl-C reaches only the daemon
             self._process = subprocess.Popen(
@@ -62,12 +62,18 @@ class LoopProcess:
                 stdin=stdin.fileno(), stdout=log, stderr=log, env=environment(),
                 pass_fds=(memory.fd, commands.fd, files, remote.fileno()), start_new_session=True,
             )  # fmt: skip
-        finally:
-            os.close(files)
-            remote.close()
-            stdin.close()
-        with orders, contextlib.suppress(OSError):  # it has ended already, which the daemon detects
-            orders.sendall((json.dumps(order) + "\n").encode())
+            kept.pop_all()
+            self._events = events
+            events.setblocking(False)
+            order = {
+                **order, "settings": settings.model_dump(mode="json"), "n": memory.n,
+                "memory": memory.fd, "commands": commands.fd, "events": remote.fileno(),
+                "files": files, "hash": configuration.hash,
+                "parent": os.getpid(),
+            }  # fmt: skip
+            stdin.close()  # else nobody notices that it has ended
+            with contextlib.suppress(OSError):  # it has, which the daemon detects
+                orders.sendall((json.dumps(order) + "\n").encode())
 
     @property
     def pid(self) -> int:
@@ -127,3 +133,16 @@ class LoopProcess:
             return f"was ended by {signal.Signals(-code).name}"
         known = {e.value: e.name.lower() for e in Exit}
         return f"ended with {code} ({known.get(code, 'unknown')})"
+
+
+def ramp_out(
+    loop: LoopProcess, seconds: float, meanwhile: Callable[[], object], clock: Clock
+) -> None:
+    """Ask a loop to stop, and wait until it has: for ``seconds`` s, unless it hangs."""
+    loop.ask_to_stop()
+    until = clock.monotonic() + seconds
+    while loop.exit_code is None and clock.monotonic() < until:
+        meanwhile()
+        clock.sleep(LOOK_EVERY)
+        if loop.hangs:
+            return

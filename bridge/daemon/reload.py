@@ -38,11 +38,18 @@ class Swap(NamedTuple):
 
 
 class Reload:
-    """A reload from its request to the new loop."""
+    """A reload from its request to the new loop.
 
-    def __init__(self, manager: ServiceManager, event_log: EventLog) -> None:
+    ``in_thread``: files are read in a thread, because a network mount may hang; otherwise at once.
+    """
+
+    def __init__(
+        self, manager: ServiceManager, event_log: EventLog, in_thread: bool = True
+    ) -> None:
         self._manager, self._event_log = manager, event_log
+        self._in_thread = in_thread
         self._requested = threading.Event()
+        self._reading: _Reading | None = None
         self._next: Configuration | None = None
         self._rearm = False  # it was compensating, and the new cell arms by itself
         self._ended = False  # since it was armed last, something else ended the motion
@@ -54,9 +61,11 @@ class Reload:
 
     def step(self, state: State, phase: Phase, running: Configuration) -> bool:
         """Continue a requested reload; returns whether the loop must ramp out now."""
-        if self._requested.is_set():
-            self._requested.clear()
-            self._read(state, running)
+        if self._requested.is_set() and self._reading is None:
+            self._begin(running)
+        if self._reading is not None and not self._reading.is_alive():
+            reading, self._reading = self._reading, None
+            self._take(state, running, reading)
         if self._next is None or self.wants_end or phase == Phase.ARMING:
             return False
         if state in (State.ARMED, State.COMPENSATING):
@@ -87,18 +96,30 @@ class Reload:
             return Swap(None, rearms=False, in_order=False)
         return Swap(following, rearms=rearm, in_order=ended)
 
-    def _read(self, state: State, running: Configuration) -> None:
-        before = running.settings
+    def _begin(self, running: Configuration) -> None:
+        """Begin to read the files."""
+        self._requested.clear()
+        reading = _Reading(running)
+        if not self._in_thread:
+            reading.run()
+        else:
+            try:
+                reading.start()
+            except RuntimeError:  # no thread can be started: tried again
+                self._requested.set()
+                return
         self._manager.reloading()
-        try:
-            new = read_configuration(before.cell)
-            self._next = _compatible(new, running)
-        except GapbridgeError as error:
+        self._reading = reading
+
+    def _take(self, state: State, running: Configuration, reading: _Reading) -> None:
+        """Take what was read, or report why not."""
+        before, new = running.settings, reading.found
+        if new is None:
             self._manager.ready()
-            detail = "; ".join(_messages(before.cell, error))
-            detail = f"the cell file was not taken, the old one stays: {detail}"
+            detail = f"the cell file was not taken, the old one stays: {reading.problem}"
             self._report(False, running if self._next is None else self._next, detail)
             return
+        self._next = new
         self._rearm = state == State.COMPENSATING and new.settings.setpoints.arm
         changed = [
             name for name in KEPT_UNTIL_RESTART
@@ -112,6 +133,24 @@ class Reload:
         self._event_log.add(
             {"kind": EventKind.CONFIGURATION, "ok": fine, "hash": active.hash, "detail": detail}
         )
+
+
+class _Reading(threading.Thread):
+    """Reads a cell and its files; nobody waits for it, not even the end of the process."""
+
+    def __init__(self, running: Configuration) -> None:
+        super().__init__(name="reload", daemon=True)
+        self._running = running
+        self.found: Configuration | None = None  # with what must not change in a run
+        self.problem = "it could not be read"  # without which nothing was found
+
+    def run(self) -> None:
+        """See threading.Thread."""
+        cell = self._running.settings.cell
+        try:
+            self.found = _compatible(read_configuration(cell), self._running)
+        except GapbridgeError as error:
+            self.problem = "; ".join(_messages(cell, error))
 
 
 def _compatible(new: Configuration, running: Configuration) -> Configuration:

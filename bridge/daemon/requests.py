@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
+from typing import NamedTuple
 
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.events import Event, EventKind
@@ -13,30 +14,41 @@ OUTLAST_LOOPS = (Command.DISARM, Command.RAMP_OUT, Command.ZERO_MOVED)
 """Commands that a new process of the loop receives if the last one did not."""
 
 
+class _Request(NamedTuple):
+    number: int
+    command: Command
+    by: str  # who or what asks
+    known: tuple[str, ...]  # what said that zeros had moved when it was made
+
+
 class Requests:
     """Requests to arm and disarm. ``make`` is for any thread, the rest for the daemon's own.
 
-    ``emit`` adds an event. ``obstacle_to`` returns why a command must not reach the loop, as text,
-    given what ``zero_moved`` says before the request is told; empty: it may.
+    ``emit`` adds an event. ``zeros_moved`` returns why joints' zeros are not trusted, as texts;
+    empty: they are. DISARM acknowledges what was known when it was made, and none of it if there is
+    more by the time it is passed on. ``obstacle_to`` returns why a command must not reach the loop,
+    as text; empty: it may. It is given whether a zero had moved before the request was told, and
+    whether the request acknowledges that.
     """
 
     def __init__(
         self,
         commands: CommandMemory,
         emit: Callable[[Event], object],
-        zero_moved: Callable[[], str],
-        obstacle_to: Callable[[Command, str], str],
+        zeros_moved: Callable[[], tuple[str, ...]],
+        obstacle_to: Callable[[Command, bool, bool], str],
     ) -> None:
         self._commands, self._emit = commands, emit
-        self._zero_moved, self._obstacle_to = zero_moved, obstacle_to
-        self._waiting: queue.SimpleQueue[tuple[int, Command, str]] = queue.SimpleQueue()
+        self._zeros_moved, self._obstacle_to = zeros_moved, obstacle_to
+        self._waiting: queue.SimpleQueue[_Request] = queue.SimpleQueue()
         self._lock = threading.RLock()
 
     def make(self, command: Command, by: str) -> int:
         """Queue a request; returns its number. ``by``: who or what asks."""
+        known = self._zeros_moved()  # first: what is found from now on is not acknowledged
         with self._lock:
             number = self._commands.number()
-            self._waiting.put((number, command, by))
+            self._waiting.put(_Request(number, command, by, known))
         return number
 
     def forward(self) -> None:
@@ -45,14 +57,17 @@ class Requests:
         Only this method writes an ARM command.
         """
         while not self._waiting.empty():
-            number, command, by = self._waiting.get()
+            number, command, by, known = self._waiting.get()
             name = "arm" if command == Command.ARM else "disarm"
-            moved = self._zero_moved()
+            moved = self._zeros_moved()
+            acknowledges = command == Command.DISARM and all(
+                what in ("", before) for what, before in zip(moved, known, strict=True)
+            )
             self._emit(
                 {"kind": EventKind.REQUEST, "command": name, "number": number, "by": by,
-                 "acknowledges": command == Command.DISARM, "detail": f"{name} requested by {by}"}
+                 "acknowledges": acknowledges, "detail": f"{name} requested by {by}"}
             )  # fmt: skip
-            if obstacle := self._obstacle_to(command, moved):
+            if obstacle := self._obstacle_to(command, any(moved), acknowledges):
                 self._emit({"kind": EventKind.REFUSED, "what": name, "detail": obstacle})
                 continue
             self._commands.ask(command, number)

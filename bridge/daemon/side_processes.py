@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.run_settings import Configuration
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
@@ -31,12 +32,17 @@ class SideProcesses:
 
     def start(
         self,
-        settings: DaemonSettings,
-        start_data: dict[str, Any],
+        configuration: Configuration,
+        session: str,
         memory: SharedMemory,
         log: IO[Any] | int,
     ) -> None:
         """Start those that the settings enable."""
+        settings = configuration.settings
+        start_data = {
+            "settings": settings.model_dump(mode="json"), "n": configuration.n, "session": session,
+            "extra": {"text": configuration.text},
+        }  # fmt: skip
         for name, (module, is_enabled) in SIDE_PROCESSES.items():
             if is_enabled(settings):
                 self._running[name] = SideProcess(module, start_data, memory, self._clock, log)
@@ -70,10 +76,10 @@ class SideProcesses:
             for name, side in self._running.items()
         }  # fmt: skip
 
-    def close(self) -> list[dict[str, Any]]:
+    def close(self, emit: Callable[[dict[str, Any]], object]) -> None:
         """Notify all that the daemon ends, and wait until they have finished.
 
-        Returns their last events, and one on each that had something to finish and did not.
+        Then emits their last events, and one on each that had something to finish and did not.
         """
         events = []
         for side in self._running.values():
@@ -84,7 +90,8 @@ class SideProcesses:
             if problem is not None and name in END_TIMEOUTS:
                 events.append({"kind": EventKind.SIDE, "side": name, "detail": problem})
         self._running.clear()
-        return events
+        for event in events:
+            emit(event)
 
 
 def _checked(name: str, event: dict[str, Any]) -> dict[str, Any]:

@@ -67,6 +67,11 @@ class DaemonStatus:
         return self._unverified or self._slip
 
     @property
+    def unacknowledged(self) -> tuple[str, str]:
+        """Return the failed verification and the slip that nobody has acknowledged; empty: none."""
+        return self._unverified, self._slip
+
+    @property
     def lasting(self) -> str:
         """Return what stays latched without this link and this daemon; empty: nothing."""
         return self._slip or ("" if self._clears_with_link else self._fault)

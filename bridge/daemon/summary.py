@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.cycle_counts import CycleCounts
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.core.arrays import Array
@@ -161,3 +163,11 @@ class Tally:
             "loop_us": work | {"max": 1e6 * self.work.largest},
             "clamped": dict(self.counts.clamped),
         }
+
+
+def places(settings: DaemonSettings) -> Iterator[str]:
+    """Yield where a run is watched, and where its setpoints are written to, as text."""
+    if settings.web is not None:
+        yield f"status page: {settings.web.url}"
+    if settings.setpoints.source == "planner":
+        yield f"setpoints: a planner writes to {settings.setpoints.socket}"

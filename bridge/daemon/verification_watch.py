@@ -59,7 +59,10 @@ class VerificationWatch:
         if self._cell is None or (self._call is not None and self._call.is_alive()):
             return None
         self._call = call = _Call(what, self._cell)
-        call.start()
+        try:
+            call.start()
+        except RuntimeError:  # no thread can be started: nobody knows either
+            return None
         call.join(self._longest_wait)
         if call.is_alive():
             return None

@@ -10,7 +10,7 @@ from gapbridge.bridge.daemon.kept_rests import KeptRests
 from gapbridge.bridge.daemon.slip_watch import SlipWatch
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.verification_watch import VerificationWatch
-from gapbridge.bridge.ipc.command_memory import Command
+from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InputError
@@ -21,7 +21,7 @@ class ZeroWatch:
     """The daemon's watches over the joints' zeros; for its own thread.
 
     ``slices``: where each field is in a cycle's row. ``status``: of the daemon, only read here.
-    ``emit`` adds an event; ``request`` asks the loop for a command, after the event that says why.
+    ``emit`` adds an event, which comes before the command to the loop that follows from it.
     """
 
     def __init__(
@@ -30,11 +30,11 @@ class ZeroWatch:
         slices: Mapping[str, slice],
         status: DaemonStatus,
         emit: Callable[[Event], object],
-        request: Callable[[Command], object],
+        commands: CommandMemory,
         clock: Clock,
     ) -> None:
         self._configuration, self._slices, self._status = configuration, slices, status
-        self._emit, self._request = emit, request
+        self._emit, self._commands = emit, commands
         settings = configuration.settings
         self.slips = self._slip_watch()
         self.kept = KeptRests(clock)
@@ -80,40 +80,47 @@ class ZeroWatch:
     def take(self, rows: Array) -> None:
         """Look for slips in cycles (k, width); hold for one."""
         for event in self.slips.take(rows):
-            self._emit(event)
-            if event["kind"] == EventKind.SLIP:
-                self._request(Command.ZERO_MOVED)
-                self.keep(at_once=True)
+            if event["kind"] != EventKind.SLIP:
+                self._emit(event)
+                continue
+            self._hold(event)
+            self.keep(at_once=True)
+
+    def _hold(self, event: Event) -> None:
+        """Emit an event, and hold for it: under a number below that of any answer to the event."""
+        number = self._commands.number()
+        self._emit(event)
+        self._commands.ask(Command.ZERO_MOVED, number)
 
     def check(self) -> None:
         """Hold if a verification has failed, until its mark is removed, or for an earlier slip."""
         slip = self.kept.slip_of_earlier_run()
         if slip is not None:
-            self._emit(slip)
-            self._request(Command.ZERO_MOVED)
+            self._hold(slip)
         event = self.verification.look()
         if event is None:
             return
-        self._emit(event)
         if not event["holds"]:
-            self._request(Command.ZERO_MOVED)
-        elif not self._status.latched:
-            self._request(Command.DISARM)  # else a person's, who sees what else is latched
+            self._hold(event)
+            return
+        self._emit(event)
+        if not self._status.latched:
+            self._commands.ask(Command.DISARM)  # else a person's, who sees what else is latched
 
-    def obstacle_to(self, command: Command, moved: str) -> str:
+    def obstacle_to(self, command: Command, moved: bool, acknowledges: bool) -> str:
         """Return why a person's request must not reach the loop, as text; empty: it may.
 
-        DISARM acknowledges a zero that had ``moved`` (as text; empty: none) when it was requested.
+        ``moved``: a zero had, before the request was told; ``acknowledges``: the request does that.
         """
-        if command == Command.DISARM:
+        if acknowledges:
             self.verification.acknowledge()
-        if command == Command.DISARM or not moved:
+        if acknowledges or not moved:
             self.check()
-        if command == Command.DISARM and moved:
+        if acknowledges and moved:
             self.slips.reset()
             self.keep(at_once=True)
         if command != Command.ARM:
             return ""
-        if moved := self._status.zero_moved:
-            return f"{moved}; acknowledge it first: gapbridge disarm"
+        if reason := self._status.zero_moved:
+            return f"{reason}; acknowledge it first: gapbridge disarm"
         return self.verification.blocked

@@ -27,7 +27,7 @@ class Command(IntEnum):
     DISARM = 2  # a person's: ramp out and observe; in a fault, acknowledge it
     RAMP_OUT = 3  # ramp out and observe; acknowledges nothing
     STOP = 4  # ramp out and end
-    ZERO_MOVED = 5  # ramp out, observe, and refuse to arm until a person has sent DISARM
+    ZERO_MOVED = 5  # ramp out, observe, and refuse to arm until a person sends a later DISARM
 
 
 class CommandMemory:
@@ -73,6 +73,10 @@ class Commands:
         self._taken_numbers = dict.fromkeys(Command, after)
         self.last_taken = after  # number of the newest request received
         self.stop = False  # STOP was received
+
+    def number_of(self, command: Command) -> int:
+        """Return the number of the last request received for a command, ``after`` before it."""
+        return self._taken_numbers[command]
 
     def take(self) -> list[Command]:
         """Return the commands since the last call, in the order of their requests.

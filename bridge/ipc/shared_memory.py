@@ -123,8 +123,8 @@ class SharedMemory:
 
     def _attach(self, fd: int, writable: bool) -> None:
         """Map this memory from now on; arrays of the former mapping stay valid."""
-        self.fd = fd
         self._map = (map_as_writer if writable else map_as_reader)(fd, self._size)
+        self.fd = fd
         self._words = np.frombuffer(self._map, np.int64, WORDS)
         self._times = np.frombuffer(self._map, np.float64, WORDS)
         rows = np.frombuffer(self._map, np.float64, ROWS * self.width, 8 * WORDS)
@@ -254,16 +254,23 @@ class RunMemory(SharedMemory):
         self._is_shown = True
 
     def renew(self) -> None:
-        """Create the memory of a new process of the loop as a copy; the last one has ended."""
+        """Create the memory of a new process of the loop as a copy; the last one has ended.
+
+        Raises OSError; then the one before stays.
+        """
         fd = make_memory(NAME, self._size)
         head = self._words.copy()
         head[[_BEATS, _PHASE, _STATE, _ENDED, _SEEN]] = 0
         head[_BEAT_TIME] = 0
-        os.pwrite(fd, head.tobytes(), 0)
-        if self.written:
-            _write_whole(fd, self._rows[: self.written], head.nbytes)
         before = self.fd
-        self._attach(fd, writable=False)  # first: other threads are reading
+        try:
+            os.pwrite(fd, head.tobytes(), 0)
+            if self.written:
+                _write_whole(fd, self._rows[: self.written], head.nbytes)
+            self._attach(fd, writable=False)  # before closing: other threads are reading
+        except OSError:
+            os.close(fd)
+            raise
         self._is_shown = False
         os.close(before)
 

@@ -118,7 +118,7 @@ class StartData:
 
 
 def read_start_data() -> StartData:
-    """Return the start data that the daemon has written on stdin."""
+    """Return the start data, which the daemon has passed as stdin."""
     start_data = json.loads(sys.stdin.readline())
     with contextlib.suppress(OSError):
         os.nice(NICENESS)

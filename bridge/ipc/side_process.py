@@ -13,8 +13,10 @@ import socket
 import subprocess
 import sys
 import termios
+from contextlib import ExitStack
 from typing import IO, Any
 
+from gapbridge.bridge.ipc.sealed_memory import sealed_bytes
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import EventLines, EventWriter
 from gapbridge.drivers.clock import Clock
@@ -27,7 +29,7 @@ PIPE_SIZE = 1 << 18  # bytes
 
 
 class SideProcess:
-    """``python -m module``, restarted with backoff if it dies or stalls.
+    """``python -m module``, restarted with backoff if it dies, stalls or cannot be started.
 
     ``start_data`` holds ``settings`` (a DaemonSettings as JSON), ``n``, ``session`` and
     ``extra``; see side_main.StartData.
@@ -44,9 +46,11 @@ class SideProcess:
         self._dropped = 0
         self._memory, self._log = memory, log
         self._process: subprocess.Popen[bytes] | None = None
+        self._down_fd: int | None = None  # None between two processes, as all that follows
+        self._unshown = False  # it has not got the newest memory
         self._wait = BACKOFF[0]
         self._retry_at = 0.0  # s, monotonic
-        self._start()
+        self._problem = self._start()  # not reported yet
 
     @property
     def pid(self) -> int | None:
@@ -56,7 +60,7 @@ class SideProcess:
     @property
     def dropped(self) -> int:
         """Return how many events it did not get because it did not read."""
-        return self._dropped + self._down.dropped
+        return self._dropped + (0 if self._down_fd is None else self._down.dropped)
 
     def emit(self, event: dict[str, Any]) -> None:
         """Send an event; if the pipe is full, the event is dropped and counted."""
@@ -67,33 +71,38 @@ class SideProcess:
 
     def show(self, memory: SharedMemory) -> None:
         """Switch it to another memory; after a restart it uses that one."""
+        self._memory = memory
         if self._process is None:
             return
-        fd = memory.open_for_reading()
-        with contextlib.suppress(OSError):
+        self._unshown = True
+        with contextlib.suppress(OSError), ExitStack() as stack:  # else ``check`` tries again
+            fd = memory.open_for_reading()
+            stack.callback(os.close, fd)
             socket.send_fds(self._successors, [b"p"], [fd])
-        os.close(fd)
+            self._unshown = False
 
     def events(self) -> list[dict[str, Any]]:
         """Return the events that it has reported."""
-        return self._up.poll()
+        return [] if self._process is None else self._up.poll()
 
     def check(self) -> str | None:
         """Check it and restart it if needed; returns its problem as text, or None."""
         now = self._now()
         if self._process is None:
-            if now >= self._retry_at:
+            problem, self._problem = self._problem, None
+            if problem is None and now >= self._retry_at:
                 self.restarts += 1
-                self._start()
-            return None
+                return self._start()
+            return problem
         code = self._process.poll()
         if code is None:
+            if self._unshown:
+                self.show(self._memory)
             return self._check_reading(now)
         self._release()
         if now - self._started > HEALTHY:
             self._wait = BACKOFF[0]
-        self._retry_at = now + self._wait
-        self._wait = min(2.0 * self._wait, BACKOFF[1])
+        self._pause()
         return f"{self.module} ended with {code}"
 
     def close(self, timeout: float = 3.0) -> tuple[list[dict[str, Any]], str | None]:
@@ -122,38 +131,60 @@ class SideProcess:
 
     # -- inside -----------------------------------------------------------------------------------
 
-    def _start(self) -> None:
-        down_read, down_write = os.pipe()
-        up_read, up_write = os.pipe()
-        with contextlib.suppress(OSError):
-            fcntl.fcntl(down_write, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
-        memory = self._memory.open_for_reading()
-        self._successors, successors = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._successors.setblocking(False)
-        passed = (down_read, up_write, memory, successors.detach())
+    def _pause(self) -> None:
+        """Wait before the next start, longer each time."""
+        self._retry_at = self._now() + self._wait
+        self._wait = min(2.0 * self._wait, BACKOFF[1])
+
+    def _start(self) -> str | None:
+        """Start it; returns as text why it cannot be started, or None."""
         try:
+            self._spawn()
+        except OSError as error:  # memory, processes or descriptors are short
+            self._pause()
+            return f"{self.module} cannot be started: {error.strerror}"
+        return None
+
+    def _spawn(self) -> None:
+        """Start the process. Raises OSError; then nothing stays open."""
+        with ExitStack() as ours, ExitStack() as passed:
+
+            def held(stack: ExitStack, fd: int) -> int:
+                stack.callback(os.close, fd)
+                return fd
+
+            read, write = os.pipe()
+            down_read, down_write = held(passed, read), held(ours, write)
+            read, write = os.pipe()
+            up_read, up_write = held(ours, read), held(passed, write)
+            with contextlib.suppress(OSError):
+                fcntl.fcntl(down_write, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
+            memory = held(passed, self._memory.open_for_reading())
+            successors, remote = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            ours.enter_context(successors)
+            passed.enter_context(remote)
+            fds = (down_read, up_write, memory, remote.fileno())
+            start_data = {
+                **self.start_data, "memory": memory, "events": down_read, "up": up_write,
+                "successors": fds[3],
+            }  # fmt: skip
+            # memory, not a pipe: however much it is, nobody waits until it has been read
+            text = (json.dumps(start_data) + "\n").encode()
+            stdin = held(passed, sealed_bytes("gapbridge-start", text))
             # spawned, not forked; in a new session, so that Ctrl-C reaches only the daemon, which
             # then ends it
-            self._process = subprocess.Popen(
+            process = subprocess.Popen(
                 [sys.executable, "-X", "faulthandler", "-m", self.module],
-                stdin=subprocess.PIPE, stdout=self._log, stderr=self._log, env=environment(),
-                pass_fds=passed, start_new_session=True,
+                stdin=stdin, stdout=self._log, stderr=self._log, env=environment(),
+                pass_fds=fds, start_new_session=True,
             )  # fmt: skip
-        finally:
-            for fd in passed:
-                os.close(fd)
-        self._down_fd: int | None = down_write
+            ours.pop_all()
+        successors.setblocking(False)
+        self._process, self._successors, self._unshown = process, successors, False
+        self._down_fd = down_write
         self._down, self._up = EventWriter(down_write), EventLines(up_read)
         self._started = self._read_at = self._now()
         self._has_read = False
-        start_data = {
-            **self.start_data, "memory": memory, "events": down_read, "up": up_write,
-            "successors": passed[3],
-        }  # fmt: skip
-        assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has ended, which check() detects
-            self._process.stdin.write((json.dumps(start_data) + "\n").encode())
-            self._process.stdin.close()
 
     def _check_reading(self, now: float) -> str | None:
         """Kill it if it has not emptied its pipe for too long."""

@@ -153,6 +153,9 @@ class Loop:
             requests = commands.take()
             for command in requests:
                 wanted = command == Command.ARM
+                if command == Command.DISARM:  # one made before a slip was known leaves it
+                    slipped = commands.number_of(Command.ZERO_MOVED)
+                    self._zero_moved &= slipped > commands.number_of(Command.DISARM)
                 if command in (Command.DISARM, Command.RAMP_OUT):
                     self._disarm(command == Command.DISARM)
                 if command == Command.ZERO_MOVED:
@@ -213,7 +216,6 @@ class Loop:
         self._supervisor.take(Cause.ZERO_MOVED, "the slip was reported just before")
 
     def _disarm(self, by_a_person: bool) -> None:
-        self._zero_moved &= not by_a_person
         if (
             self._supervisor.state == State.OBSERVING
         ):  # asked by a person, or after a verification that passed

@@ -542,13 +542,13 @@ def _keeps_faults(patch: Patch) -> None:
 
 
 def _ends_at_a_bad_cell_file(patch: Patch) -> None:
-    read = Reload._read
+    take = Reload._take
 
     def other(self: Any, *given: Any) -> None:
-        read(self, *given)
+        take(self, *given)
         self._next = self._next or given[1]  # the one that runs, as if it were new
 
-    patch.setattr(Reload, "_read", other)
+    patch.setattr(Reload, "_take", other)
 
 
 def _stays_at_the_limit(patch: Patch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -13,12 +14,16 @@ import pytest
 
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.daemon.daemon import STOP_MARGIN, TICK, Daemon
+from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import STOP_TIMEOUT, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_ramp_out
+from gapbridge.bridge.loop.supervisor import Cause
+from gapbridge.core.errors import LinkError
 from gapbridge.drivers.clock import Clock
 
 CELL = """robot: {model: ur10e}
@@ -52,6 +57,8 @@ class Played(LoopProcess):
     """A loop that reads states and ends when it is to stop, unless it is ``deaf``.
 
     ``silent``: its heart stands still. ``dies``: the exit code with which it dies at 0.5 s.
+    ``ramps``: s that it takes to stop. ``ends``: s at which its trajectory does; ``tells``:
+    its state and the event of how it came there.
     """
 
     pid = 1
@@ -65,9 +72,12 @@ class Played(LoopProcess):
         self.how, self.order, self._clock = how, order, clock
         self._now, self.started = clock.monotonic, clock.monotonic()
         self.killed_at: float | None = None
+        self.asked_at: float | None = None  # to stop
         self.own = SharedMemory(memory.n, memory.fd, clock=clock)
         self.own.enter(Phase.RUNNING)
         self.own.note_state_read()
+        self._news = [how["tells"]] if "tells" in how else []
+        self.own.note_state(State[how["tells"]["to"]] if "tells" in how else State.OBSERVING)
 
     @property
     def exit_code(self) -> int | None:
@@ -75,22 +85,32 @@ class Played(LoopProcess):
             self.own.beat()
         if self.killed_at is not None:
             return -9
+        if "ends" in self.how and self._clock.now > self.how["ends"]:
+            self.own.note_ended()
         if "dies" in self.how and self._clock.now > 0.5:
             return int(self.how["dies"])
-        stops = self._commands.last_of(Command.STOP) and "deaf" not in self.how
-        return Exit.DONE if stops else None
+        if self.asked_at is None and self._commands.last_of(Command.STOP):
+            self.asked_at = self._clock.now
+        if self.asked_at is None or "deaf" in self.how:
+            return None
+        return Exit.DONE if self._clock.now >= self.asked_at + self.how.get("ramps", 0.0) else None
 
     def events(self) -> list[dict[str, Any]]:
-        return []
+        news, self._news = self._news, []
+        return news
 
     def kill(self) -> None:
         self.killed_at = self._clock.now
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        if self.exit_code is None:
+            self.kill()
 
 
 class Bench(Daemon):
-    """A daemon without locks, sockets and side processes; each loop of it does as it is told."""
+    """A daemon without sockets and side processes; each loop of it does as it is told."""
+
+    locked = False  # it owns its controller
 
     def __init__(self, folder: Path, *how: dict[str, Any], may_write: bool = True) -> None:
         cell = folder / "cell.yaml"
@@ -100,13 +120,20 @@ class Bench(Daemon):
         todo = iter(how)
 
         def make(*given: Any) -> Played:
-            self.loops.append(Played(next(todo, {}), *given))
+            told = next(todo, {})
+            if "refused" in told:
+                raise OSError(errno.EAGAIN, "no process is left")
+            self.loops.append(Played(told, *given))
             return self.loops[-1]
 
         self.loop_process = make  # type: ignore[assignment]
 
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
-        return arm
+        if not self.locked:
+            return arm
+        return self._take_over(
+            stack.enter_context(OwnerLock("host 192.0.2.7", self.settings.cell)), arm, by
+        )
 
     def run_until(self, seconds: float, arm: bool = False) -> RunSummary:
         """Run, and ask to stop after so many seconds."""
@@ -180,3 +207,85 @@ def test_loops_that_die_are_started_again_more_and_more_slowly(tmp_path: Path) -
     expected = [min(2.0**k * first, most) for k in range(1, len(begun))]
     assert waits == pytest.approx(expected, abs=4 * TICK)
     assert len(waits) > 2
+
+
+def test_a_loop_that_cannot_be_started_counts_as_one_that_ended(tmp_path: Path) -> None:
+    daemon = Bench(tmp_path, {"dies": Exit.CRASH}, {"refused": True}, {"refused": True})
+    summary = daemon.run_until(5.0, arm=True)
+    detail = "the loop's process cannot be started: no process is left"
+    assert summary.faults[1:] == (detail, detail)
+    assert summary.restarts == 3
+    first, second = daemon.loops
+    assert second.order["after"] >= daemon.asked[Command.ARM] > first.order["after"]
+    assert second.started - first.started > 0.5 + 7 * daemon.settings.backoff[0]  # 1 + 2 + 4
+
+
+def test_a_first_loop_that_cannot_be_started_ends_the_run(tmp_path: Path) -> None:
+    with pytest.raises(LinkError, match="cannot be started"):
+        Bench(tmp_path, {"refused": True}).run_until(5.0)
+
+
+def fault(to: State, cause: Cause) -> dict[str, Any]:
+    return {
+        "kind": "transition", "from": "HOLDING", "to": to.name, "cause": cause, "detail": "",
+        "time": 100.0, "monotonic": 100.0,
+    }  # fmt: skip
+
+
+class Owner(Bench):
+    """One that owns its controller, and whose cell file says that it arms."""
+
+    locked = True
+
+    def run_as_a_service(self, seconds: float) -> RunSummary:
+        """Run; returns how it went."""
+        self.clock.acts[seconds] = self.stop
+        try:
+            return self.run(arm=True, by="the cell file")
+        finally:
+            self.armed = bool(self._commands.last_of(Command.ARM))
+            self._commands.close()
+            self.memory.close()
+
+
+@pytest.mark.parametrize(
+    ("how", "arms", "latched"),
+    [
+        ({}, True, ""),
+        ({"tells": fault(State.FAULT, Cause.UNSAFE)}, False, Cause.UNSAFE),
+        ({"tells": fault(State.FAULT, Cause.SILENCE)}, False, ""),  # ends with that link
+        ({"ends": 0.4, "ramps": 1.0, "dies": Exit.LINK}, False, ""),  # in the last ramp
+    ],
+)
+def test_what_has_not_ended_in_order_does_not_begin_again_by_itself(
+    runtime: Path, tmp_path: Path, how: dict[str, Any], arms: bool, latched: str
+) -> None:
+    first, second = Owner(tmp_path, how), Owner(tmp_path)
+    first.run_as_a_service(2.0)
+    assert first.armed
+    second.run_as_a_service(2.0)
+    assert second.armed == arms
+    assert second.loops[0].order["latched"] == latched
+    third = Owner(tmp_path)
+    third.run_as_a_service(2.0)  # the second ended in order, unless it has the fault
+    assert third.armed == (not latched)
+
+
+def fails() -> None:
+    raise ZeroDivisionError
+
+
+@pytest.mark.parametrize("how", [{"ramps": 0.7}, {"deaf": True}])
+def test_a_daemon_that_fails_has_its_loop_ramp_out(tmp_path: Path, how: dict[str, Any]) -> None:
+    daemon = Bench(tmp_path, how)
+    daemon.clock.acts[1.0] = fails
+    with pytest.raises(ZeroDivisionError):
+        daemon.run_until(30.0)
+    (loop,) = daemon.loops
+    assert daemon.asked[Command.STOP]
+    if "deaf" not in how:
+        assert loop.killed_at is None
+        return
+    assert loop.killed_at is not None
+    own = STOP_TIMEOUT + longest_ramp_out(daemon.settings.limits)  # the loop's deadline
+    assert own < loop.killed_at - 1.0 < own + STOP_MARGIN + 5 * TICK

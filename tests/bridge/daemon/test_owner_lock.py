@@ -19,7 +19,7 @@ from gapbridge.bridge.cell.runtime_folder import runtime_folder, state_folder
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.ipc.control_client import ask
 from gapbridge.bridge.ipc.loop_state import State
-from gapbridge.core.errors import InputError
+from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.controller_address import address_of
 
 pytestmark = pytest.mark.usefixtures("runtime")
@@ -78,6 +78,38 @@ def test_an_owner_that_died_while_it_wrote_a_shorter_note_did_not_end_in_order()
     _let_go_as_the_kernel_does(first)
     with OwnerLock("host 192.0.2.10", CELL) as lock:
         assert lock.before == {"pid": 7}
+
+
+def test_an_owner_that_fails_did_not_end_in_order() -> None:
+    with pytest.raises(RuntimeError):
+        _own("host 192.0.2.13", "robot not ready: protective stop", RuntimeError())
+    assert list(state_folder().glob("*.running"))
+    with OwnerLock("host 192.0.2.13", CELL) as lock:
+        assert lock.before["latched"] == "robot not ready: protective stop"
+        assert "did not end in order" in lock.disorder
+
+
+@pytest.mark.parametrize("error", [InputError, LinkError])
+def test_a_run_that_was_refused_at_its_start_is_as_if_there_had_been_none(
+    error: type[Exception],
+) -> None:
+    with pytest.raises(error):
+        _own("host 192.0.2.14", "", error("refused"))
+    assert not list(state_folder().glob("*.running"))
+    with pytest.raises(RuntimeError):
+        _own("host 192.0.2.14", "zero moved", RuntimeError())
+    for _ in range(2):  # the robot is off; whoever starts it again still learns of the first
+        with pytest.raises(error):
+            _own("host 192.0.2.14", "", error("refused"))
+    assert list(state_folder().glob("*.running"))
+    with OwnerLock("host 192.0.2.14", CELL) as lock:
+        assert lock.before["latched"] == "zero moved"
+
+
+def _own(address: str, latched: str, error: Exception) -> None:
+    with OwnerLock(address, CELL) as lock:
+        lock.note_latched(latched)
+        raise error
 
 
 def _let_go_as_the_kernel_does(lock: OwnerLock) -> None:

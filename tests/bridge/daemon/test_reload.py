@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ import pytest
 from daemon_cell import Robot, Run, offsets
 from patience import wait_for
 
-from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
+from gapbridge.bridge.daemon import reload
 from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.ipc.events import EventKind, EventLog
@@ -30,11 +32,11 @@ setpoints: {arm: true}
 class Taking:
     """A reload of a cell that arms by itself, asked for while the arm compensates."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, in_thread: bool = False) -> None:
         cell = folder / "cell.yaml"
         cell.write_text(CELL)
         self.running = read_configuration(cell)
-        self.reload = Reload(ServiceManager(clock=SYSTEM), EventLog(clock=SYSTEM))
+        self.reload = Reload(ServiceManager(clock=SYSTEM), EventLog(clock=SYSTEM), in_thread)
         self.request("arm")
         self.reload.ask()
 
@@ -46,6 +48,49 @@ class Taking:
 
     def transition(self, cause: Cause, before: State = State.HOLDING) -> None:
         self.reload.on_event({"kind": EventKind.TRANSITION, "from": before.name, "cause": cause})
+
+
+def test_a_folder_that_does_not_answer_keeps_the_daemon_not_waiting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taking, answers, readings = Taking(tmp_path, in_thread=True), threading.Event(), list[str]()
+
+    def hangs(_: Path) -> Configuration:
+        readings.append(threading.current_thread().name)
+        answers.wait(10.0)
+        return taking.running
+
+    monkeypatch.setattr(reload, "read_configuration", hangs)
+    for _ in range(3):
+        assert not taking.step(State.COMPENSATING)  # it is still read
+        taking.reload.ask()  # and is to be read again
+    reading = taking.reload._reading
+    assert reading is not None
+    answers.set()
+    reading.join()
+    assert taking.step(State.COMPENSATING)
+    assert taking.step(State.COMPENSATING)
+    again = taking.reload._reading
+    if again is not None:  # it may have been as fast
+        again.join()
+    taking.step(State.HOLDING)
+    assert readings == ["reload"] * 2
+
+
+def test_without_a_thread_the_files_are_read_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuses(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    taking = Taking(tmp_path, in_thread=True)
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", refuses)
+        assert not taking.step(State.COMPENSATING)
+    taking.step(State.COMPENSATING)
+    if (reading := taking.reload._reading) is not None:
+        reading.join()
+    assert taking.step(State.COMPENSATING)
 
 
 @pytest.mark.parametrize("connects", [False, True])

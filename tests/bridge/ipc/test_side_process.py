@@ -133,6 +133,20 @@ def test_what_it_says_at_its_end_is_returned_and_that_it_did_not_finish(
     assert problem == "side_under_test did not finish within 0.1 s and was killed"
 
 
+def test_nobody_waits_until_it_has_read_its_start_data(
+    start: Callable[[str], SideProcess], start_data: dict[str, Any]
+) -> None:
+    start_data["extra"]["text"] = "x" * (1 << 20)  # more than any pipe holds
+    reads = (
+        "from gapbridge.bridge.ipc.side_main import read_start_data\nstart = read_start_data()\n"
+    )
+    reads += 'start.emit({"kind": "hello", "size": len(start.extra["text"])})\n'
+    assert hear(start(reads), "hello")["size"] == 1 << 20
+    begun = time.monotonic()
+    start("import time\ntime.sleep(20.0)")
+    assert time.monotonic() - begun < 20.0
+
+
 def test_one_that_is_killed_comes_back_and_the_later_the_more_often(
     start: Callable[..., SideProcess],
 ) -> None:

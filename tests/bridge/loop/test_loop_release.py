@@ -76,7 +76,10 @@ class Waiting(Source):
 
 
 class Asked:
-    """Commands by cycle; the loop is to stop after the last."""
+    """Commands by cycle, which is their number, too; the loop is to stop after the last.
+
+    A pair is a command and the number under which it was made earlier.
+    """
 
     stop = False
     last_taken = 0
@@ -84,6 +87,10 @@ class Asked:
     def __init__(self, loop: Loop, script: dict[int, Any], cycles: int) -> None:
         self._loop, self._script, self._cycles = loop, script, cycles
         self._cycle = 0
+        self._numbers = dict.fromkeys(Command, 0)
+
+    def number_of(self, command: Command) -> int:
+        return self._numbers[command]
 
     def take(self) -> list[Command]:
         self._cycle += 1
@@ -93,7 +100,11 @@ class Asked:
         if callable(found):
             found()
             return []
-        return [] if found is None else [found]
+        if found is None:
+            return []
+        command, number = found if isinstance(found, tuple) else (found, self._cycle)
+        self._numbers[command] = number
+        return [command]
 
 
 class Bench:
@@ -161,6 +172,16 @@ def test_a_fault_releases_the_driver_once_and_ends_when_it_is_acknowledged(bench
     bench.run({10: Command.ARM, 40: stops, 60: is_fine, 70: Command.DISARM})
     assert bench.driver.noted == ["armed", "released"]
     assert bench.causes()[-2:] == [Cause.UNSAFE, Cause.ACKNOWLEDGED]
+
+
+@pytest.mark.parametrize(("made", "acknowledged"), [(9, False), (11, True)])
+def test_a_disarming_that_was_made_before_a_slip_does_not_acknowledge_it(
+    bench: Bench, made: int, acknowledged: bool
+) -> None:
+    bench.run({10: Command.ZERO_MOVED, 12: (Command.DISARM, made), 40: Command.ARM})
+    refused = [event["detail"] for event in bench.events if event["kind"] == "refused"]
+    assert refused == [] if acknowledged else "zero has moved" in refused[0]
+    assert ("writing" in bench.causes()) == acknowledged
 
 
 def test_only_who_disarms_an_arm_that_is_not_armed_acknowledges_what_stands_still(
