@@ -445,6 +445,7 @@ def _writes_whenever_it_reads(patch: Patch) -> None:
 def _sees_no_stop(patch: Patch) -> None:
     patch.setattr(checks, "why_not_ready", lambda _: "")
     patch.setattr(OffsetWriter, "unanswered_since", lambda _: math.inf)
+    patch.setattr(OffsetWriter, "keep_alive", lambda _: None)  # sees the program's end
 
 
 def _takes_old_states(patch: Patch) -> None:
