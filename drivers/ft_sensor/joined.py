@@ -189,7 +189,8 @@ class TcpForce:
         # prepared once: Model.predict would do it in every cycle
         rigid = model.without_terms()
         self._chain, self._rows = rigid.chain(), rigid.rows(np.zeros((1, model.arm.n)))
-        self._undeclared = [t for t in model.terms if t.effect in correcting("payload")]
+        undeclared = correcting("payload")
+        self._undeclared = [t for t in model.terms if t.effect in undeclared]
         self._no_loads = Loads()
         self._place = np.empty((1, 3)), np.empty((1, 3, 3))
         self._flange_in_base()  # loads compiled code before the first cycle

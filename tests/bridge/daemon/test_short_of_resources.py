@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import socket
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
@@ -21,7 +20,6 @@ from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.verification_watch import VerificationWatch
 from gapbridge.bridge.ipc import side_process
 from gapbridge.bridge.ipc.command_memory import CommandMemory
-from gapbridge.bridge.ipc.control_socket import ControlSocket
 from gapbridge.bridge.ipc.shared_memory import RunMemory, SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.drivers.clock import SYSTEM, Clock
@@ -174,21 +172,3 @@ def test_without_a_thread_what_was_learned_of_the_zeros_is_kept_later(
     kept.step(None, None, at_once=True)  # type: ignore[arg-type]
     kept.close()
     assert (tmp_path / "rests.json").read_text() == "b"
-
-
-def test_without_a_thread_a_client_is_turned_away_and_the_next_one_is_served(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "x.sock"
-    with ControlSocket(path, lambda command, _: {"ok": True, "answer": command}):
-        for patched, answer in ((True, b""), (False, b'{"ok": true, "answer": "status"}\n')):
-            with monkeypatch.context() as patch, socket.socket(socket.AF_UNIX) as client:
-                if patched:
-                    patch.setattr(threading.Thread, "start", starts_no_thread)
-                client.settimeout(10.0)
-                client.connect(str(path))
-                client.sendall(b'{"command": "status"}\n')
-                try:
-                    assert client.recv(1000) == answer
-                except ConnectionResetError:  # it was closed with the request unread
-                    assert patched
