@@ -104,6 +104,7 @@ class Positioning:
         if self.joints.can_move and self._confirmed_load != load:
             count = sum(p.load == load for p in self.session.stops)
             self.prompt.say()
+            self._may_move = False  # a command typed as the answer leaves here
             self._may_move = self.prompt.confirm(
                 f"The arm will be moved to {count} poses with load {load + 1}, at most "
                 f"{self._speed:g} rad/s. Keep clear, a hand at the stop button. Move it?"
@@ -141,7 +142,7 @@ class Positioning:
         return sample
 
     def _move(self, pose: PlannedPose) -> None:
-        """Move the arm to the pose; after a failed move ask whether to continue."""
+        """Move the arm to the pose; after a failed move only a 'yes' lets it move again."""
         via = self._find_path(pose)
         while via is not None:
             try:
@@ -149,12 +150,13 @@ class Positioning:
                     self.joints.move_to(pose, via)
             except RunError as error:
                 self.prompt.warn(str(error))
+                # withdrawn before asking: a command typed as the answer leaves here
+                load, self._confirmed_load, self._may_move = self._confirmed_load, None, False
                 if self.prompt.confirm("  Continue from here?"):
+                    self._confirmed_load, self._may_move = load, True
                     via = self._find_path(pose)
                     continue
                 self.prompt.say("  jog it to this pose, or `quit` and look at the arm")
-                self._may_move = False
-                self._confirmed_load = None
             return
 
     def _at_pose(self, pose: PlannedPose) -> bool:

@@ -1,0 +1,53 @@
+"""The arm moves only while the operator's last answer permits it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scripted_positioning import (
+    ScriptedJoints,
+    ScriptedPrompt,
+    ScriptEnded,
+    Tracker,
+    measuring,
+    session_of,
+)
+
+from gapbridge.core.calibration.plan import PlannedPose
+from gapbridge.core.errors import RunError
+
+
+class Arm(ScriptedJoints):
+    """An arm whose first move ends with a protective stop."""
+
+    def __init__(self) -> None:
+        super().__init__(np.zeros(6), self._go)
+        self.moves: list[int] = []
+
+    def _go(self, pose: PlannedPose) -> None:
+        self.moves.append(pose.number)
+        if len(self.moves) == 1:
+            raise RunError("the move failed: protective stop")
+        self.q = pose.q
+
+
+@pytest.mark.parametrize("answer", ["skip", "undo", "moved", "slipped", "back"])
+def test_after_a_failed_move_a_command_is_no_yes(answer: str) -> None:
+    arm, prompt = Arm(), ScriptedPrompt("yes", answer)
+    with pytest.raises(ScriptEnded, match="The arm will be moved"):
+        measuring(session_of(3), prompt, arm, Tracker(manual=False)).run()
+    assert arm.moves == [0]
+
+
+def test_after_a_failed_move_yes_continues_the_load() -> None:
+    arm, session = Arm(), session_of(3)
+    measuring(session, ScriptedPrompt("yes", "yes"), arm, Tracker(manual=False)).run()
+    assert arm.moves == [0, 0, 1, 2]
+    assert [r.stop for r in session.accepted] == [0, 1, 2]
+
+
+def test_after_a_failed_move_no_leaves_the_arm_to_the_operator() -> None:
+    arm, prompt = Arm(), ScriptedPrompt("yes", "no")
+    with pytest.raises(ScriptEnded, match="measured as soon as it rests there"):
+        measuring(session_of(3), prompt, arm, Tracker(manual=False)).run()
+    assert arm.moves == [0]
