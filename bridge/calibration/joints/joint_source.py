@@ -53,7 +53,7 @@ class JointSource(ABC):
         """Return a sample of the arm at rest. Raises ReadingError if it does not come to rest."""
 
     def unmoved_since(self, sample: JointSample) -> bool:
-        """Return whether the arm has not moved since the sample."""
+        """Return whether the arm has not moved since the sample; raises ReadingError: unknown."""
         return True
 
     def move_to(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:

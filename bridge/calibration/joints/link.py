@@ -42,6 +42,7 @@ ACCELERATION = 1.0  # rad/s2, of the fastest joint
 MIN_DURATION = 0.5  # s of a move
 DWELL = 0.2  # s at the end of a move
 BUFFER_SPAN = 20.0  # s of cycles in memory
+SILENCE = 0.5  # s without a cycle after which it is unknown where the arm is
 DIRECTION_THRESHOLD = 1e-5  # rad: least motion that sets the approach direction
 UNLIMITED = 1e9  # s, duration of a run
 
@@ -84,9 +85,12 @@ class LinkedJoints(JointSource):
             run.stop()
 
     def current_q(self) -> Array | None:
-        """Return the joint angles (n,), rad, of the newest cycle; None without any."""
-        rows = self._recent_cycles(0.1)
-        return None if not len(rows) else np.asarray(rows[-1, self._columns("actual_q")])
+        """Return the joint angles (n,), rad, of the newest cycle; None while the link is silent."""
+        try:
+            rows = self._recent_cycles(0.1)
+        except ReadingError:
+            return None
+        return np.asarray(rows[-1, self._columns("actual_q")])
 
     def arrived(self, pose: PlannedPose) -> JointSample | None:
         """Return a sample once the arm is at rest near the pose; None before."""
@@ -96,17 +100,21 @@ class LinkedJoints(JointSource):
         return self._sample()
 
     def sample_at_rest(self, pose: PlannedPose) -> JointSample:
-        """Return a sample. Raises ReadingError if the arm moves or its force is not steady."""
+        """Return a sample.
+
+        Raises ReadingError if the arm moves, its force is not steady, or the link is silent.
+        """
         until = self._clock.monotonic() + max(5.0, 4.0 * self._settle)
         while self._clock.monotonic() < until:
             if self._at_rest() and self._force_steady():
                 return self._sample()
             self._clock.sleep(0.02)
+        self._recent_cycles(0.0)  # raises if the link is silent
         why = "the force at the tool is not steady" if self._at_rest() else "the arm moves"
         raise ReadingError(f"{why}, expected it at rest for {self._settle:g} s")
 
     def unmoved_since(self, sample: JointSample) -> bool:
-        """Return whether the arm has not moved since the sample."""
+        """Return whether the arm has not moved since the sample; raises ReadingError: unknown."""
         rows = self._recent_cycles(0.1)
         q = rows[:, self._columns("actual_q")].mean(axis=0)
         return bool(np.abs(q - sample.q).max() < MOTION_THRESHOLD)
@@ -158,7 +166,7 @@ class LinkedJoints(JointSource):
         started = self._clock.monotonic()
         limit = settings.link.connect_timeout + LINK_MARGIN
         until = started + limit
-        while not len(self._recent_cycles(1.0)):
+        while self.current_q() is None:
             now = self._clock.monotonic()
             if run.daemon.phase == Phase.STARTING and now < started + START_TIMEOUT:
                 until = now + limit  # slow imports on a busy machine
@@ -176,18 +184,29 @@ class LinkedJoints(JointSource):
         return self._active_run().slices[name]
 
     def _recent_cycles(self, span: float) -> Array:
-        """Return the cycles (M, width) of the last ``span`` s."""
+        """Return the cycles (M, width) of the last ``span`` s, at least one.
+
+        Raises ReadingError while the link is silent: the arm may be elsewhere by now.
+        """
         run = self._active_run()
         run.read_cycles()
         rows = run.rows
-        if not len(rows):
-            return rows
+        if not len(rows) or run.daemon.state == State.DISCONNECTED:
+            raise ReadingError("the link to the arm is down, expected the arm's joints")
+        silent = self._clock.monotonic() - rows[-1, run.slices["received"].start]
+        if silent > SILENCE:
+            raise ReadingError(
+                f"the controller has reported nothing for {silent:.1f} s, expected the arm's joints"
+            )
         time_at = rows[:, run.slices["timestamp"].start]
         return np.asarray(rows[time_at >= time_at[-1] - span])
 
     def _at_rest(self) -> bool:
-        """Return whether the arm has not moved for the settling time."""
-        rows, time_column = self._recent_cycles(self._settle), self._columns("timestamp").start
+        """Return whether the arm has not moved for the settling time; False if it is silent."""
+        try:
+            rows, time_column = self._recent_cycles(self._settle), self._columns("timestamp").start
+        except ReadingError:
+            return False
         buffer = self._active_run().rows
         if buffer[-1, time_column] - buffer[0, time_column] < self._settle:
             return False
@@ -287,10 +306,16 @@ class DaemonRun:
             return
         if not len(new):
             return
-        time_column = self.slices["timestamp"].start
         self._update_approach(new[:, self.slices["actual_q"]])
         rows = np.vstack([self.rows, new])
-        self.rows = rows[rows[:, time_column] >= rows[-1, time_column] - BUFFER_SPAN]
+        timestamp, received, loop = (
+            rows[:, self.slices[name].start] for name in ("timestamp", "received", "loop")
+        )
+        # what came before another process, a restarted controller or a gap is of another time
+        breaks = (np.diff(loop) != 0) | (np.diff(timestamp) < 0) | (np.diff(received) > SILENCE)
+        recent = timestamp >= timestamp[-1] - BUFFER_SPAN
+        recent[: np.append(0, np.flatnonzero(breaks) + 1)[-1]] = False
+        self.rows = rows[recent]
 
     def _update_approach(self, q: Array) -> None:
         last = q[0].copy() if self._last_moved is None else self._last_moved

@@ -198,7 +198,10 @@ class Positioning:
                 self.prompt.warn(str(error))
 
     def _wait_for_jogging(self, pose: PlannedPose) -> JointSample | None:
-        """Wait until the arm is at rest at the pose, or the operator accepts its position."""
+        """Wait until the arm is at rest at the pose, or the operator accepts its position.
+
+        Raises ReadingError if the arm does not come to rest, or nothing is known of it.
+        """
         question = "  measured as soon as it rests there (Enter: where it is now)"
         typed = self.prompt.ask_unless(question, lambda: self.joints.arrived(pose))
         if isinstance(typed, JointSample):
@@ -208,7 +211,7 @@ class Positioning:
             return None
         now = self.joints.current_q()
         if now is None:
-            return None
+            raise ReadingError("the controller reports no joints now: is the link to the arm up?")
         apart = np.abs(now - pose.q)
         if apart.max() > CONFIRM_DISTANCE:
             joint = int(apart.argmax())

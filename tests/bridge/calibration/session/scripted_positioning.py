@@ -60,11 +60,11 @@ class ScriptedPrompt(Prompt):
 
 
 class ScriptedJoints(JointSource):
-    """An arm that is where ``q`` says; ``move`` is called for each move."""
+    """An arm that is where ``q`` (n,), rad, says; ``move`` is called for each move."""
 
     detects_rest = True
 
-    def __init__(self, q: Array, move: Callable[[PlannedPose], None] | None = None) -> None:
+    def __init__(self, q: Array | None, move: Callable[[PlannedPose], None] | None = None) -> None:
         self.q, self._move = q, move
         self.can_move = move is not None
 
@@ -72,13 +72,15 @@ class ScriptedJoints(JointSource):
         return self.q
 
     def sample_at_rest(self, pose: PlannedPose) -> JointSample:
+        assert self.q is not None
         return JointSample(self.q)
 
     def arrived(self, pose: PlannedPose) -> JointSample | None:
-        return self.sample_at_rest(pose) if np.abs(self.q - pose.q).max() < 0.01 else None
+        there = self.q is not None and np.abs(self.q - pose.q).max() < 0.01
+        return self.sample_at_rest(pose) if there else None
 
     def unmoved_since(self, sample: JointSample) -> bool:
-        return bool(np.abs(self.q - sample.q).max() < 2e-4)
+        return self.q is not None and bool(np.abs(self.q - sample.q).max() < 2e-4)
 
     def move_to(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
         assert self._move is not None

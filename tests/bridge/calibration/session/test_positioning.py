@@ -1,4 +1,4 @@
-"""The arm moves only while the operator's last answer permits it."""
+"""The arm moves only while the operator's last answer permits it, and is measured at rest."""
 
 from __future__ import annotations
 
@@ -51,3 +51,10 @@ def test_after_a_failed_move_no_leaves_the_arm_to_the_operator() -> None:
     with pytest.raises(ScriptEnded, match="measured as soon as it rests there"):
         measuring(session_of(3), prompt, arm, Tracker(manual=False)).run()
     assert arm.moves == [0]
+
+
+def test_enter_does_not_measure_an_arm_that_reports_nothing() -> None:
+    prompt = ScriptedPrompt("")
+    with pytest.raises(ScriptEnded, match="measured as soon as it rests there"):
+        measuring(session_of(1), prompt, ScriptedJoints(None), Tracker(manual=True)).run()
+    assert "! the controller reports no joints now: is the link to the arm up?" in prompt.shown
