@@ -57,7 +57,10 @@ class JointSource(ABC):
         return True
 
     def move_to(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
-        """Move the arm to a pose through joint angles ``via``, each (n,) rad. Raises RunError."""
+        """Move the arm to a pose through joint angles ``via``, each (n,) rad.
+
+        Raises RunError if the move fails, LinkError if the arm cannot be observed any more.
+        """
         raise RunError("this session does not move the arm")
 
     def __enter__(self) -> Self:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from gapbridge.bridge.cell.run_settings import settings_of
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.daemon.daemon import Daemon
+from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import CycleReader, Phase
 from gapbridge.bridge.setpoint_source.quintic import quintic, quintic_time, write_trajectory
@@ -44,6 +46,7 @@ DWELL = 0.2  # s at the end of a move
 BUFFER_SPAN = 20.0  # s of cycles in memory
 SILENCE = 0.5  # s without a cycle after which it is unknown where the arm is
 DIRECTION_THRESHOLD = 1e-5  # rad: least motion that sets the approach direction
+ACTIVE = (State.ARMED.name, State.COMPENSATING.name, State.HOLDING.name)
 UNLIMITED = 1e9  # s, duration of a run
 
 
@@ -120,39 +123,48 @@ class LinkedJoints(JointSource):
         return bool(np.abs(q - sample.q).max() < MOTION_THRESHOLD)
 
     def move_to(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
-        """Move the arm to a pose at ``speed`` and wait until it rests there. Raises RunError."""
+        """Move the arm to a pose at ``speed`` and wait until it rests there.
+
+        Raises RunError if that fails: the daemon only observes then. LinkError: it cannot even.
+        """
         if not self.can_move:
             return super().move_to(pose, via)
         begin = self.current_q()
         if begin is None:
-            raise LinkError("the arm reports no joints, expected where it stands before a move")
+            raise RunError("the arm reports no joints, expected where it stands before a move")
         file = self._folder / "move.csv"
         duration = write_move(file, [begin, *via, pose.q], self._speed)
         moving = SetpointSettings(source="trajectory", file=file.resolve())
         self.close()
-        self._start(self._settings.model_copy(update={"setpoints": moving}), write=True)
-        self._wait_for_arrival(pose, duration)
+        try:
+            self._start(self._settings.model_copy(update={"setpoints": moving}), write=True)
+            self._wait_for_arrival(pose, duration)
+        except RunError as error:
+            self._observe_after(error)
         return None
+
+    def _observe_after(self, error: RunError) -> NoReturn:
+        """Observe the arm after a failed move, and raise the error; LinkError if that fails too."""
+        self.close()
+        try:
+            self.open()
+        except LinkError as lost:
+            raise LinkError(f"{error}; {lost}") from error
+        raise RunError(str(error)) from error
 
     def _wait_for_arrival(self, pose: PlannedPose, duration: float) -> None:
         """Wait until the arm rests at the pose, then disarm the daemon. Raises RunError."""
         run = self._active_run()
         limit = MAX_SLOWDOWN * duration + LINK_MARGIN
         until = self._clock.monotonic() + limit
-        writing, message_count = False, 0
         while True:
-            state = run.daemon.state
-            if not writing and state == State.COMPENSATING:
-                writing, message_count = True, len(run.messages())
-            if writing and not state.writes:
-                why = "; ".join(run.messages(message_count)) or state.name.lower()
-                raise RunError(f"the move failed: {why}")
+            if run.failure:
+                raise RunError(f"the move failed: {run.failure}")
             q = self.current_q()
             at_pose = q is not None and np.abs(q - pose.q).max() < ARRIVAL_TOLERANCE / 10
-            if writing and at_pose and run.daemon.memory.ended and self._at_rest():
+            if at_pose and run.daemon.memory.ended and self._at_rest():
                 break
             if self._clock.monotonic() > until:
-                run.stop()
                 raise RunError(f"the arm did not arrive within {limit:.0f} s")
             self._clock.sleep(0.02)
         run.daemon.disarm()
@@ -258,19 +270,31 @@ class DaemonRun:
     """One run of the daemon in a thread, with a buffer of its last cycles."""
 
     def __init__(self, settings: DaemonSettings, write: bool, clock: Clock) -> None:
-        self.daemon = Daemon(settings, write, clock, self._say)
+        self.daemon = Daemon(settings, write, clock, self._say, self._note)
         self.slices = self.daemon.memory.slices
         self.rows = np.empty((0, self.daemon.memory.width))
         self.approach = np.zeros(self.daemon.memory.n)
         self._last_moved: Array | None = None  # (n,) rad, where each joint last moved to
         self._reader: CycleReader | None = self.daemon.memory.reader()
         self._messages: list[str] = []
+        self._mark = 0  # number of the first message since it was armed, or began to write
+        self.failure = ""  # why the daemon did not begin to write, or has ceased
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._main, args=(write,), daemon=True)
         self._thread.start()
 
     def _say(self, text: str) -> None:
         self._messages.append(text)
+
+    def _note(self, event: Event) -> None:
+        """Note why the daemon does not write; its message of the event has been said before."""
+        kind, before, after = event["kind"], event.get("from"), event.get("to")
+        if after in (State.ARMED.name, State.COMPENSATING.name):
+            self._mark = len(self._messages)
+        elif kind == EventKind.TRANSITION and before in ACTIVE and after != State.HOLDING.name:
+            self.failure = "; ".join(self._messages[self._mark :])
+        elif kind == EventKind.FAULT or (kind == EventKind.REFUSED and event.get("what") == "arm"):
+            self.failure = str(event["detail"])
 
     def _main(self, write: bool) -> None:
         try:
@@ -281,10 +305,6 @@ class DaemonRun:
     def message(self) -> str:
         """Return the last message of the daemon."""
         return self._messages[-1] if self._messages else ""
-
-    def messages(self, since: int = 0) -> list[str]:
-        """Return the messages of the daemon from number ``since`` on."""
-        return self._messages[since:]
 
     def check(self) -> None:
         """Raise the error that ended the run, LinkError if it ended without one."""

@@ -14,7 +14,7 @@ from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.calibration.plan import PlannedPose
-from gapbridge.core.errors import RunError
+from gapbridge.core.errors import LinkError, RunError
 
 CONFIRM_DISTANCE = np.radians(3.0)  # rad: farther from the pose than this, it asks for confirmation
 AT_POSE = 2e-3  # rad: an arm this near to the pose is not moved
@@ -148,6 +148,8 @@ class Positioning:
             try:
                 with self.prompt.waiting("driving"):
                     self.joints.move_to(pose, via)
+            except LinkError:  # nothing observes the arm: the session is to be resumed
+                raise
             except RunError as error:
                 self.prompt.warn(str(error))
                 # withdrawn before asking: a command typed as the answer leaves here

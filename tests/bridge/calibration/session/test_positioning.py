@@ -14,7 +14,7 @@ from scripted_positioning import (
 )
 
 from gapbridge.core.calibration.plan import PlannedPose
-from gapbridge.core.errors import RunError
+from gapbridge.core.errors import LinkError, RunError
 
 
 class Arm(ScriptedJoints):
@@ -51,6 +51,15 @@ def test_after_a_failed_move_no_leaves_the_arm_to_the_operator() -> None:
     with pytest.raises(ScriptEnded, match="measured as soon as it rests there"):
         measuring(session_of(3), prompt, arm, Tracker(manual=False)).run()
     assert arm.moves == [0]
+
+
+def test_an_arm_that_cannot_be_observed_after_a_move_ends_the_session() -> None:
+    def lose(pose: PlannedPose) -> None:
+        raise LinkError("the arm did not arrive; the arm reports nothing")
+
+    arm, prompt = ScriptedJoints(np.zeros(6), lose), ScriptedPrompt("yes", "yes")
+    with pytest.raises(LinkError, match="reports nothing"):
+        measuring(session_of(1), prompt, arm, Tracker(manual=False)).run()
 
 
 def test_enter_does_not_measure_an_arm_that_reports_nothing() -> None:
