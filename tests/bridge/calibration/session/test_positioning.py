@@ -13,6 +13,8 @@ from scripted_positioning import (
     session_of,
 )
 
+from gapbridge.bridge.calibration.instruments.instrument import ReadingError
+from gapbridge.bridge.calibration.joints.joint_source import JointSample
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import LinkError, RunError
 
@@ -60,6 +62,34 @@ def test_an_arm_that_cannot_be_observed_after_a_move_ends_the_session() -> None:
     arm, prompt = ScriptedJoints(np.zeros(6), lose), ScriptedPrompt("yes", "yes")
     with pytest.raises(LinkError, match="reports nothing"):
         measuring(session_of(1), prompt, arm, Tracker(manual=False)).run()
+
+
+def test_a_typed_reading_of_an_arm_that_settled_late_is_typed_once_more() -> None:
+    arm, session = ScriptedJoints(np.full(6, 0.1)), session_of(1)
+
+    def settle() -> None:
+        arm.q = np.full(6, 0.1004)
+
+    instrument, prompt = Tracker(manual=True, read=settle), ScriptedPrompt()
+    measuring(session, prompt, arm, instrument).run()
+    assert prompt.shown.count("! the arm moved while it was measured") == 1
+    np.testing.assert_array_equal(session.accepted[0].q, arm.q)
+
+
+def test_a_reading_is_typed_again_where_the_link_was_silent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    arm, session, silences = ScriptedJoints(np.full(6, 0.1)), session_of(1), ["nothing for 3 s"]
+
+    def unmoved(sample: JointSample) -> bool:
+        if silences:
+            arm.q = np.full(6, 0.1005)
+            raise ReadingError(silences.pop())
+        return bool((sample.q == arm.q).all())
+
+    monkeypatch.setattr(arm, "unmoved_since", unmoved)
+    measuring(session, ScriptedPrompt(), arm, Tracker(manual=True)).run()
+    np.testing.assert_array_equal(session.accepted[0].q, arm.q)
 
 
 def test_enter_does_not_measure_an_arm_that_reports_nothing() -> None:
