@@ -51,6 +51,10 @@ class ReadingError(Exception):
     """The instrument gave no valid reading; the message says why. The reading is repeated."""
 
 
+class ArmMovedError(ReadingError):
+    """The arm has left where its joints were sampled, or may have: they are sampled again."""
+
+
 class Instrument(ABC, Generic[S]):
     """One instrument; not thread-safe. The constructor opens nothing."""
 

@@ -53,11 +53,14 @@ class JointSource(ABC):
         """Return a sample of the arm at rest. Raises ReadingError if it does not come to rest."""
 
     def unmoved_since(self, sample: JointSample) -> bool:
-        """Return whether the arm has not moved since the sample."""
+        """Return whether the arm has not moved since the sample; raises ReadingError: unknown."""
         return True
 
     def move_to(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
-        """Move the arm to a pose through joint angles ``via``, each (n,) rad. Raises RunError."""
+        """Move the arm to a pose through joint angles ``via``, each (n,) rad.
+
+        Raises RunError if the move fails, LinkError if the arm cannot be observed any more.
+        """
         raise RunError("this session does not move the arm")
 
     def __enter__(self) -> Self:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from gapbridge.bridge.cell.run_settings import settings_of
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.daemon.daemon import Daemon
+from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import CycleReader, Phase
 from gapbridge.bridge.setpoint_source.quintic import quintic, quintic_time, write_trajectory
@@ -42,7 +44,9 @@ ACCELERATION = 1.0  # rad/s2, of the fastest joint
 MIN_DURATION = 0.5  # s of a move
 DWELL = 0.2  # s at the end of a move
 BUFFER_SPAN = 20.0  # s of cycles in memory
+SILENCE = 0.5  # s without a cycle after which it is unknown where the arm is
 DIRECTION_THRESHOLD = 1e-5  # rad: least motion that sets the approach direction
+ACTIVE = (State.ARMED.name, State.COMPENSATING.name, State.HOLDING.name)
 UNLIMITED = 1e9  # s, duration of a run
 
 
@@ -84,9 +88,12 @@ class LinkedJoints(JointSource):
             run.stop()
 
     def current_q(self) -> Array | None:
-        """Return the joint angles (n,), rad, of the newest cycle; None without any."""
-        rows = self._recent_cycles(0.1)
-        return None if not len(rows) else np.asarray(rows[-1, self._columns("actual_q")])
+        """Return the joint angles (n,), rad, of the newest cycle; None while the link is silent."""
+        try:
+            rows = self._recent_cycles(0.1)
+        except ReadingError:
+            return None
+        return np.asarray(rows[-1, self._columns("actual_q")])
 
     def arrived(self, pose: PlannedPose) -> JointSample | None:
         """Return a sample once the arm is at rest near the pose; None before."""
@@ -96,55 +103,68 @@ class LinkedJoints(JointSource):
         return self._sample()
 
     def sample_at_rest(self, pose: PlannedPose) -> JointSample:
-        """Return a sample. Raises ReadingError if the arm moves or its force is not steady."""
+        """Return a sample.
+
+        Raises ReadingError if the arm moves, its force is not steady, or the link is silent.
+        """
         until = self._clock.monotonic() + max(5.0, 4.0 * self._settle)
         while self._clock.monotonic() < until:
             if self._at_rest() and self._force_steady():
                 return self._sample()
             self._clock.sleep(0.02)
+        self._recent_cycles(0.0)  # raises if the link is silent
         why = "the force at the tool is not steady" if self._at_rest() else "the arm moves"
         raise ReadingError(f"{why}, expected it at rest for {self._settle:g} s")
 
     def unmoved_since(self, sample: JointSample) -> bool:
-        """Return whether the arm has not moved since the sample."""
+        """Return whether the arm has not moved since the sample; raises ReadingError: unknown."""
         rows = self._recent_cycles(0.1)
         q = rows[:, self._columns("actual_q")].mean(axis=0)
         return bool(np.abs(q - sample.q).max() < MOTION_THRESHOLD)
 
     def move_to(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
-        """Move the arm to a pose at ``speed`` and wait until it rests there. Raises RunError."""
+        """Move the arm to a pose at ``speed`` and wait until it rests there.
+
+        Raises RunError if that fails: the daemon only observes then. LinkError: it cannot even.
+        """
         if not self.can_move:
             return super().move_to(pose, via)
         begin = self.current_q()
         if begin is None:
-            raise LinkError("the arm reports no joints, expected where it stands before a move")
+            raise RunError("the arm reports no joints, expected where it stands before a move")
         file = self._folder / "move.csv"
         duration = write_move(file, [begin, *via, pose.q], self._speed)
         moving = SetpointSettings(source="trajectory", file=file.resolve())
         self.close()
-        self._start(self._settings.model_copy(update={"setpoints": moving}), write=True)
-        self._wait_for_arrival(pose, duration)
+        try:
+            self._start(self._settings.model_copy(update={"setpoints": moving}), write=True)
+            self._wait_for_arrival(pose, duration)
+        except RunError as error:
+            self._observe_after(error)
         return None
+
+    def _observe_after(self, error: RunError) -> NoReturn:
+        """Observe the arm after a failed move, and raise the error; LinkError if that fails too."""
+        self.close()
+        try:
+            self.open()
+        except LinkError as lost:
+            raise LinkError(f"{error}; {lost}") from error
+        raise RunError(str(error)) from error
 
     def _wait_for_arrival(self, pose: PlannedPose, duration: float) -> None:
         """Wait until the arm rests at the pose, then disarm the daemon. Raises RunError."""
         run = self._active_run()
         limit = MAX_SLOWDOWN * duration + LINK_MARGIN
         until = self._clock.monotonic() + limit
-        writing, message_count = False, 0
         while True:
-            state = run.daemon.state
-            if not writing and state == State.COMPENSATING:
-                writing, message_count = True, len(run.messages())
-            if writing and not state.writes:
-                why = "; ".join(run.messages(message_count)) or state.name.lower()
-                raise RunError(f"the move failed: {why}")
+            if run.failure:
+                raise RunError(f"the move failed: {run.failure}")
             q = self.current_q()
             at_pose = q is not None and np.abs(q - pose.q).max() < ARRIVAL_TOLERANCE / 10
-            if writing and at_pose and run.daemon.memory.ended and self._at_rest():
+            if at_pose and run.daemon.memory.ended and self._at_rest():
                 break
             if self._clock.monotonic() > until:
-                run.stop()
                 raise RunError(f"the arm did not arrive within {limit:.0f} s")
             self._clock.sleep(0.02)
         run.daemon.disarm()
@@ -158,7 +178,7 @@ class LinkedJoints(JointSource):
         started = self._clock.monotonic()
         limit = settings.link.connect_timeout + LINK_MARGIN
         until = started + limit
-        while not len(self._recent_cycles(1.0)):
+        while self.current_q() is None:
             now = self._clock.monotonic()
             if run.daemon.phase == Phase.STARTING and now < started + START_TIMEOUT:
                 until = now + limit  # slow imports on a busy machine
@@ -176,18 +196,29 @@ class LinkedJoints(JointSource):
         return self._active_run().slices[name]
 
     def _recent_cycles(self, span: float) -> Array:
-        """Return the cycles (M, width) of the last ``span`` s."""
+        """Return the cycles (M, width) of the last ``span`` s, at least one.
+
+        Raises ReadingError while the link is silent: the arm may be elsewhere by now.
+        """
         run = self._active_run()
         run.read_cycles()
         rows = run.rows
-        if not len(rows):
-            return rows
+        if not len(rows) or run.daemon.state == State.DISCONNECTED:
+            raise ReadingError("the link to the arm is down, expected the arm's joints")
+        silent = self._clock.monotonic() - rows[-1, run.slices["received"].start]
+        if silent > SILENCE:
+            raise ReadingError(
+                f"the controller has reported nothing for {silent:.1f} s, expected the arm's joints"
+            )
         time_at = rows[:, run.slices["timestamp"].start]
         return np.asarray(rows[time_at >= time_at[-1] - span])
 
     def _at_rest(self) -> bool:
-        """Return whether the arm has not moved for the settling time."""
-        rows, time_column = self._recent_cycles(self._settle), self._columns("timestamp").start
+        """Return whether the arm has not moved for the settling time; False if it is silent."""
+        try:
+            rows, time_column = self._recent_cycles(self._settle), self._columns("timestamp").start
+        except ReadingError:
+            return False
         buffer = self._active_run().rows
         if buffer[-1, time_column] - buffer[0, time_column] < self._settle:
             return False
@@ -239,19 +270,31 @@ class DaemonRun:
     """One run of the daemon in a thread, with a buffer of its last cycles."""
 
     def __init__(self, settings: DaemonSettings, write: bool, clock: Clock) -> None:
-        self.daemon = Daemon(settings, write, clock, self._say)
+        self.daemon = Daemon(settings, write, clock, self._say, self._note)
         self.slices = self.daemon.memory.slices
         self.rows = np.empty((0, self.daemon.memory.width))
         self.approach = np.zeros(self.daemon.memory.n)
         self._last_moved: Array | None = None  # (n,) rad, where each joint last moved to
         self._reader: CycleReader | None = self.daemon.memory.reader()
         self._messages: list[str] = []
+        self._mark = 0  # number of the first message since it was armed, or began to write
+        self.failure = ""  # why the daemon did not begin to write, or has ceased
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._main, args=(write,), daemon=True)
         self._thread.start()
 
     def _say(self, text: str) -> None:
         self._messages.append(text)
+
+    def _note(self, event: Event) -> None:
+        """Note why the daemon does not write; its message of the event has been said before."""
+        kind, before, after = event["kind"], event.get("from"), event.get("to")
+        if after in (State.ARMED.name, State.COMPENSATING.name):
+            self._mark = len(self._messages)
+        elif kind == EventKind.TRANSITION and before in ACTIVE and after != State.HOLDING.name:
+            self.failure = "; ".join(self._messages[self._mark :])
+        elif kind == EventKind.FAULT or (kind == EventKind.REFUSED and event.get("what") == "arm"):
+            self.failure = str(event["detail"])
 
     def _main(self, write: bool) -> None:
         try:
@@ -262,10 +305,6 @@ class DaemonRun:
     def message(self) -> str:
         """Return the last message of the daemon."""
         return self._messages[-1] if self._messages else ""
-
-    def messages(self, since: int = 0) -> list[str]:
-        """Return the messages of the daemon from number ``since`` on."""
-        return self._messages[since:]
 
     def check(self) -> None:
         """Raise the error that ended the run, LinkError if it ended without one."""
@@ -287,10 +326,16 @@ class DaemonRun:
             return
         if not len(new):
             return
-        time_column = self.slices["timestamp"].start
         self._update_approach(new[:, self.slices["actual_q"]])
         rows = np.vstack([self.rows, new])
-        self.rows = rows[rows[:, time_column] >= rows[-1, time_column] - BUFFER_SPAN]
+        timestamp, received, loop = (
+            rows[:, self.slices[name].start] for name in ("timestamp", "received", "loop")
+        )
+        # what came before another process, a restarted controller or a gap is of another time
+        breaks = (np.diff(loop) != 0) | (np.diff(timestamp) < 0) | (np.diff(received) > SILENCE)
+        recent = timestamp >= timestamp[-1] - BUFFER_SPAN
+        recent[: np.append(0, np.flatnonzero(breaks) + 1)[-1]] = False
+        self.rows = rows[recent]
 
     def _update_approach(self, q: Array) -> None:
         last = q[0].copy() if self._last_moved is None else self._last_moved

@@ -9,8 +9,14 @@ from typing import Any
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.session.journal import FILE, VERSION, Entry, read_entries
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
+from gapbridge.bridge.cell.settings.instruments import (
+    METRES,
+    DialGaugeSettings,
+    InstrumentSettings,
+    SphereSettings,
+)
 from gapbridge.core.errors import InputError
+from gapbridge.drivers.controller_address import address_of
 
 FIXED_KEYS = (
     "robot", "tool", "payload", "gravity", "reference_temperature", "compliance", "effects",
@@ -53,6 +59,7 @@ def start_entry(cell: Cell, options: SessionOptions) -> dict[str, Any]:
         "cell": str(cell.path.resolve()),
         "arm": cell.arm.name,
         "model": _model_keys(cell),
+        **_identity(cell),
         "instrument": options.instrument.model_dump(mode="json"),
         "seed": options.seed,
     }
@@ -63,8 +70,14 @@ def _model_keys(cell: Cell) -> dict[str, Any]:
     return {key: settings[key] for key in FIXED_KEYS}
 
 
+def _identity(cell: Cell) -> dict[str, str]:
+    """Return what tells the cell's arm from another of its model; empty text: not given."""
+    link = "" if cell.link is None else address_of(cell.link)
+    return {"link": link, "serial": cell.calibration.serial}
+
+
 def check_start(entry: Entry, cell: Cell, options: SessionOptions, folder: Path) -> None:
-    """Raise InputError if a session was started with another model, kind or instrument."""
+    """Raise InputError if a session was started with another arm, model, kind or instrument."""
     if entry.get("version") != VERSION:
         raise InputError(
             f"{folder}: found a session of version {entry.get('version')}, expected {VERSION}"
@@ -81,16 +94,45 @@ def check_start(entry: Entry, cell: Cell, options: SessionOptions, folder: Path)
             f"{cell.path}: {changed[0]}: found it changed since the session in {folder} began, "
             "expected the same; for the changed cell begin another with --session"
         )
-    measured = _measures(entry.get("instrument", {}))
-    if measured != options.instrument.measures:
+    for key, name in (("link", "link"), ("serial", "calibration.serial")):
+        before, now = entry.get(key), _identity(cell)[key]
+        if before and now and before != now:
+            raise InputError(
+                f"{cell.path}: {name}: found {now!r}, expected {before!r} of the session in "
+                f"{folder}; for another arm begin another with --session"
+            )
+    _check_instrument(_instrument_of(entry.get("instrument", {})), options.instrument, folder)
+
+
+def _check_instrument(before: InstrumentSettings, now: InstrumentSettings, folder: Path) -> None:
+    """Raise InputError if two instruments' readings do not belong into one session."""
+    if before.measures != now.measures:
         raise InputError(
-            f"{folder}: found readings of kind {measured}, expected {options.instrument.measures} "
-            f"of --instrument {options.instrument.kind}: one session has one kind"
+            f"{folder}: found readings of kind {before.measures}, expected {now.measures} "
+            f"of --instrument {now.kind}: one session has one kind"
         )
+    expected, found = _lengths(before), _lengths(now)
+    for name in expected.keys() & found.keys():
+        if expected[name] != found[name]:
+            raise InputError(
+                f"{folder}: found an instrument whose {name} is {found[name]}, expected "
+                f"{expected[name]} as when the session began; begin another with --session"
+            )
 
 
-def _measures(entry: dict[str, Any]) -> str:
+def _lengths(instrument: InstrumentSettings) -> dict[str, str]:
+    """Return the lengths that its readings contain, as text."""
+    lengths: dict[str, float | None] = {}
+    if isinstance(instrument, DialGaugeSettings):
+        zero = instrument.zero
+        lengths["zero"] = None if zero is None else zero * METRES[instrument.unit]
+    elif isinstance(instrument, SphereSettings):
+        lengths["radius"] = instrument.radius
+    return {k: "to be estimated" if v is None else f"{v:.9g} m" for k, v in lengths.items()}
+
+
+def _instrument_of(entry: dict[str, Any]) -> InstrumentSettings:
     from pydantic import TypeAdapter
 
     adapter: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
-    return adapter.validate_python(entry).measures
+    return adapter.validate_python(entry)

@@ -9,6 +9,7 @@ import numpy as np
 from gapbridge.bridge.calibration.format import force_text, millimetres, reading_text
 from gapbridge.bridge.calibration.instruments.instrument import (
     AnyInstrument,
+    ArmMovedError,
     ReadingError,
     ReadRequest,
 )
@@ -49,15 +50,15 @@ def capture(
     instrument: AnyInstrument, joints: JointSource, pose: PlannedPose,
     joint_sample: JointSample | None, request: ReadRequest,
 ) -> CapturedReading:  # fmt: skip
-    """Read the instrument. Raises ReadingError if it fails or the arm moves, LinkError.
+    """Read the instrument. Raises ReadingError if it fails, ArmMovedError, LinkError.
 
     ``joint_sample`` None: the joints are sampled after the instrument was read.
     """
     samples = instrument.read(request)
     if joint_sample is None:
         joint_sample = joints.sample_at_rest(pose)
-    elif not joints.unmoved_since(joint_sample):
-        raise ReadingError("the arm moved while it was measured")
+    else:
+        _require_unmoved(joints, joint_sample)
     if instrument.needs_wrench and joint_sample.raw_wrench is None:
         raise LinkError("the controller sends no ft_raw_wrench, expected a force sensor's reading")
     values = samples.values
@@ -69,6 +70,16 @@ def capture(
         spread = float(np.sqrt(lengths.var(axis=0, ddof=1).mean()))
     std = spread / np.sqrt(len(values))
     return CapturedReading(joint_sample, mean(values), std, spread, len(values), samples.source)
+
+
+def _require_unmoved(joints: JointSource, sample: JointSample) -> None:
+    """Raise ArmMovedError if the arm has moved since the sample, or that is unknown."""
+    try:
+        unmoved = joints.unmoved_since(sample)
+    except ReadingError as error:
+        raise ArmMovedError(str(error)) from error
+    if not unmoved:
+        raise ArmMovedError("the arm moved while it was measured")
 
 
 def mean(values: Array) -> Array:
@@ -170,6 +181,7 @@ class Measuring:
                 self.prompt.warn(str(error))
                 if not self.instrument.manual:
                     self.prompt.enter("  Enter to try again")
+                if not self.instrument.manual or isinstance(error, ArmMovedError):
                     joint_sample = self.positioning.reach(pose)
         arm = captured.joint_sample
         before = self.session.accepted[-1].q if self.session.accepted else arm.q

@@ -14,7 +14,7 @@ from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.calibration.plan import PlannedPose
-from gapbridge.core.errors import RunError
+from gapbridge.core.errors import LinkError, RunError
 
 CONFIRM_DISTANCE = np.radians(3.0)  # rad: farther from the pose than this, it asks for confirmation
 AT_POSE = 2e-3  # rad: an arm this near to the pose is not moved
@@ -104,6 +104,7 @@ class Positioning:
         if self.joints.can_move and self._confirmed_load != load:
             count = sum(p.load == load for p in self.session.stops)
             self.prompt.say()
+            self._may_move = False  # a command typed as the answer leaves here
             self._may_move = self.prompt.confirm(
                 f"The arm will be moved to {count} poses with load {load + 1}, at most "
                 f"{self._speed:g} rad/s. Keep clear, a hand at the stop button. Move it?"
@@ -141,20 +142,23 @@ class Positioning:
         return sample
 
     def _move(self, pose: PlannedPose) -> None:
-        """Move the arm to the pose; after a failed move ask whether to continue."""
+        """Move the arm to the pose; after a failed move only a 'yes' lets it move again."""
         via = self._find_path(pose)
         while via is not None:
             try:
                 with self.prompt.waiting("driving"):
                     self.joints.move_to(pose, via)
+            except LinkError:  # nothing observes the arm: the session is to be resumed
+                raise
             except RunError as error:
                 self.prompt.warn(str(error))
+                # withdrawn before asking: a command typed as the answer leaves here
+                load, self._confirmed_load, self._may_move = self._confirmed_load, None, False
                 if self.prompt.confirm("  Continue from here?"):
+                    self._confirmed_load, self._may_move = load, True
                     via = self._find_path(pose)
                     continue
                 self.prompt.say("  jog it to this pose, or `quit` and look at the arm")
-                self._may_move = False
-                self._confirmed_load = None
             return
 
     def _at_pose(self, pose: PlannedPose) -> bool:
@@ -196,7 +200,10 @@ class Positioning:
                 self.prompt.warn(str(error))
 
     def _wait_for_jogging(self, pose: PlannedPose) -> JointSample | None:
-        """Wait until the arm is at rest at the pose, or the operator accepts its position."""
+        """Wait until the arm is at rest at the pose, or the operator accepts its position.
+
+        Raises ReadingError if the arm does not come to rest, or nothing is known of it.
+        """
         question = "  measured as soon as it rests there (Enter: where it is now)"
         typed = self.prompt.ask_unless(question, lambda: self.joints.arrived(pose))
         if isinstance(typed, JointSample):
@@ -206,7 +213,7 @@ class Positioning:
             return None
         now = self.joints.current_q()
         if now is None:
-            return None
+            raise ReadingError("the controller reports no joints now: is the link to the arm up?")
         apart = np.abs(now - pose.q)
         if apart.max() > CONFIRM_DISTANCE:
             joint = int(apart.argmax())

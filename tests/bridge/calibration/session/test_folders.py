@@ -1,0 +1,79 @@
+"""A session is resumed only with its own arm and instrument."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gapbridge.bridge.calibration.options import SessionOptions
+from gapbridge.bridge.calibration.session.folders import check_start, start_entry
+from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.core.errors import InputError
+
+LINK = "link: {driver: ur_rtde, host: 192.168.0.10}\n"
+GAUGE = "{kind: dial_gauge, unit: mm, zero: 250.0}"
+
+
+def cell_of(folder: Path, link: str, serial: str, instrument: str, name: str = "cell.yaml") -> Cell:
+    path = folder / name
+    path.write_text(
+        "robot: {model: ur10e}\n" + link
+        + f"calibration: {{serial: '{serial}', instrument: {instrument}}}\n", encoding="utf-8",
+    )  # fmt: skip
+    return load_cell(path)
+
+
+def resume(before: Cell, now: Cell) -> None:
+    """Start a session with one cell, and check whether another may resume it."""
+    entry = start_entry(before, SessionOptions("whole", None, before.calibration.instrument))
+    options = SessionOptions("whole", None, now.calibration.instrument)
+    check_start(entry, now, options, Path("sessions/one"))
+
+
+@pytest.mark.parametrize(
+    ("link", "serial", "instrument", "why"),
+    [
+        (LINK.replace(".10", ".11"), "A-1", GAUGE, r"link: found 'host 192.168.0.11', expected"),
+        (LINK, "B-2", GAUGE, "calibration.serial: found 'B-2', expected 'A-1'"),
+        (LINK, "A-1", GAUGE.replace("250.0", "251.0"), "zero is 0.251 m, expected 0.25 m"),
+        (LINK, "A-1", "{kind: dial_gauge, unit: mm}", "zero is to be estimated, expected 0.25 m"),
+        (LINK, "A-1", "{kind: point}", "readings of kind distance, expected point"),
+    ],
+)
+def test_another_arm_or_zero_is_refused(
+    tmp_path: Path, link: str, serial: str, instrument: str, why: str
+) -> None:
+    before = cell_of(tmp_path, LINK, "A-1", GAUGE)
+    now = cell_of(tmp_path, link, serial, instrument, "other.yaml")
+    with pytest.raises(InputError, match=why) as caught:
+        resume(before, now)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [("{kind: sphere, radius: 0.03}", "{kind: sphere}"),
+     ("{kind: sphere}", "{kind: sphere, radius: 0.03}")],
+)  # fmt: skip
+def test_another_radius_is_refused(tmp_path: Path, before: str, now: str) -> None:
+    with pytest.raises(InputError, match="radius is"):
+        resume(cell_of(tmp_path, "", "", before), cell_of(tmp_path, "", "", now))
+
+
+@pytest.mark.parametrize(
+    ("link", "serial", "instrument"),
+    [
+        (LINK, "A-1", GAUGE),
+        ("", "", GAUGE),  # given later, or no longer
+        (LINK.replace("ur_rtde", "modbus, profile: ur"), "A-1", GAUGE),
+        (LINK, "A-1", "{kind: dial_gauge, unit: m, zero: 0.25, serial: new}"),
+    ],
+)
+def test_a_copy_of_the_cell_resumes_it(
+    tmp_path: Path, link: str, serial: str, instrument: str
+) -> None:
+    before = cell_of(tmp_path, LINK, "A-1", GAUGE)
+    now = cell_of(tmp_path, link, serial, instrument, "copy.yaml")
+    resume(before, now)
+    resume(now, before)
