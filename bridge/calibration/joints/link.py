@@ -43,7 +43,7 @@ PERIOD = 0.01  # s between rows; the daemon interpolates linearly
 ACCELERATION = 1.0  # rad/s2, of the fastest joint
 MIN_DURATION = 0.5  # s of a move
 DWELL = 0.2  # s at the end of a move
-BUFFER_SPAN = 20.0  # s of cycles in memory
+BUFFER_SPAN = 5.0  # s of cycles in memory, beyond the time in which the arm settles
 SILENCE = 0.5  # s without a cycle after which it is unknown where the arm is
 DIRECTION_THRESHOLD = 1e-5  # rad: least motion that sets the approach direction
 ACTIVE = (State.ARMED.name, State.COMPENSATING.name, State.HOLDING.name)
@@ -174,7 +174,7 @@ class LinkedJoints(JointSource):
     # -- cycles of the daemon ----------------------------------------------------------------------
 
     def _start(self, settings: DaemonSettings, write: bool) -> None:
-        self._run = run = DaemonRun(settings, write, self._clock)
+        self._run = run = DaemonRun(settings, write, self._clock, self._settle)
         started = self._clock.monotonic()
         limit = settings.link.connect_timeout + LINK_MARGIN
         until = started + limit
@@ -269,7 +269,10 @@ def write_move(path: Path, stops: Sequence[Array], speed: float) -> float:
 class DaemonRun:
     """One run of the daemon in a thread, with a buffer of its last cycles."""
 
-    def __init__(self, settings: DaemonSettings, write: bool, clock: Clock) -> None:
+    def __init__(
+        self, settings: DaemonSettings, write: bool, clock: Clock, settle: float = 0.0
+    ) -> None:
+        self._span = settle + BUFFER_SPAN
         self.daemon = Daemon(settings, write, clock, self._say, self._note)
         self.slices = self.daemon.memory.slices
         self.rows = np.empty((0, self.daemon.memory.width))
@@ -333,7 +336,7 @@ class DaemonRun:
         )
         # what came before another process, a restarted controller or a gap is of another time
         breaks = (np.diff(loop) != 0) | (np.diff(timestamp) < 0) | (np.diff(received) > SILENCE)
-        recent = timestamp >= timestamp[-1] - BUFFER_SPAN
+        recent = timestamp >= timestamp[-1] - self._span
         recent[: np.append(0, np.flatnonzero(breaks) + 1)[-1]] = False
         self.rows = rows[recent]
 

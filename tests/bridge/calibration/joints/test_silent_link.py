@@ -16,7 +16,7 @@ from gapbridge.bridge.calibration.instruments.instrument import (
     ReadRequest,
 )
 from gapbridge.bridge.calibration.instruments.joint_only import PointContact
-from gapbridge.bridge.calibration.joints.link import DaemonRun, LinkedJoints
+from gapbridge.bridge.calibration.joints.link import BUFFER_SPAN, DaemonRun, LinkedJoints
 from gapbridge.bridge.calibration.session.measuring import capture
 from gapbridge.bridge.cell.settings.instruments import PointSettings
 from gapbridge.bridge.ipc.loop_state import State
@@ -56,15 +56,17 @@ class Controller:
         return rows
 
 
-def observed(controller: Controller, clock: ByHand) -> tuple[LinkedJoints, SimpleNamespace]:
+def observed(
+    controller: Controller, clock: ByHand, settle: float = 0.5
+) -> tuple[LinkedJoints, SimpleNamespace]:
     """Return joints that observe a controller, and their daemon."""
     daemon = SimpleNamespace(state=State.OBSERVING)
     run: Any = object.__new__(DaemonRun)
     run.slices, run.rows, run.daemon = SLICES, controller.drain(), daemon
     run.approach, run._last_moved, run._reader = np.zeros(6), None, controller
-    run._thread = SimpleNamespace(is_alive=lambda: True)
+    run._thread, run._span = SimpleNamespace(is_alive=lambda: True), settle + BUFFER_SPAN
     joints: Any = object.__new__(LinkedJoints)
-    joints._run, joints._clock, joints._settle = run, clock, 0.5
+    joints._run, joints._clock, joints._settle = run, clock, settle
     return joints, daemon
 
 
@@ -126,6 +128,15 @@ def test_after_a_restart_of_the_controller_the_arm_is_read_where_it_is(
     sample = joints.arrived(pose_at(THERE))
     assert sample is not None
     np.testing.assert_allclose(sample.q, THERE, atol=1e-9)
+
+
+def test_the_arm_may_take_as_long_to_settle_as_the_cell_allows(
+    clock: ByHand, controller: Controller
+) -> None:
+    joints, _ = observed(controller, clock, settle=60.0)
+    for seconds, rests in ((59.0, False), (2.0, True), (20.0, True)):
+        controller.reports(HERE, seconds)
+        assert (joints.arrived(pose_at(HERE)) is not None) is rests
 
 
 def test_rest_is_not_counted_from_before_a_gap(clock: ByHand, controller: Controller) -> None:
