@@ -31,17 +31,22 @@ def _is_taken(folder: Path, session: str) -> bool:
     return bool(segments(folder, session)) or (folder / f"{session}{LOOP_LOG}").exists()
 
 
+def recordings(folder: Path) -> list[tuple[str, int, Path]]:
+    """Return run, number and path of each file that a recorder named, in this order.
+
+    Names alone do not order them: -1000.mcap sorts before -999.mcap. Raises OSError.
+    """
+    matches = [(path, NAME.match(path.name)) for path in folder.iterdir()]
+    return sorted(
+        (match["session"], int(match["number"]), path) for path, match in matches if match
+    )
+
+
 def segments(folder: Path, session: str) -> list[Path]:
     """Return the files of a run, in order."""
     if not folder.is_dir():
         return []
-    matches = [(path, NAME.match(path.name)) for path in folder.iterdir()]
-    numbered = [
-        (int(match["number"]), path)
-        for path, match in matches
-        if match and match["session"] == session
-    ]
-    return [path for _, path in sorted(numbered)]
+    return [path for name, _, path in recordings(folder) if name == session]
 
 
 def next_path(folder: Path, session: str) -> Path:
@@ -65,19 +70,18 @@ def prune(folder: Path, session: str, keep_total: float | None) -> list[Path]:
     """
     if keep_total is None:
         return []
-    files = [path for path in folder.iterdir() if NAME.match(path.name)]
-    sizes = {path: path.stat().st_size for path in files if path.is_file()}
-    total, gone = sum(sizes.values()), []
-    oldest = sorted(sizes, key=lambda path: (path.name.startswith(f"{session}-"), path.name))
-    for path in oldest:
+    files = [(name, path) for name, _, path in recordings(folder) if path.is_file()]
+    sizes = {path: path.stat().st_size for _, path in files}
+    total, gone = sum(sizes.values()), {}
+    for name, path in sorted(files, key=lambda file: file[0] == session):  # keeps their order
         if total <= keep_total * MB:
             break
         with contextlib.suppress(OSError):
             path.unlink()
             total -= sizes[path]
-            gone.append(path)
-    for name in {match["session"] for path in gone if (match := NAME.match(path.name))}:
+            gone[path] = name
+    for name in set(gone.values()):
         if name != session and not segments(folder, name):
             with contextlib.suppress(OSError):
                 (folder / f"{name}{LOOP_LOG}").unlink()
-    return gone
+    return list(gone)
