@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
 
-from recorded import SESSION
+import pytest
+from recorded import SESSION, Desk, publish
+from test_recorder import numbers
 
+from gapbridge.bridge.recording import folder as folder_module
 from gapbridge.bridge.recording.finishing import unfinished
-from gapbridge.bridge.recording.folder import next_path, prune, segments
+from gapbridge.bridge.recording.folder import new_session, next_path, prune, segments
 
 OTHER = "run-20260102-080000"
 MB = 1_000_000
@@ -39,3 +43,44 @@ def test_files_that_were_cut_off_are_finished_in_the_order_of_their_numbers(
 ) -> None:
     paths = files(tmp_path, SESSION, 998, 999, 1000)
     assert unfinished(tmp_path) == paths
+
+
+def test_a_file_that_another_daemon_is_writing_does_not_make_room(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    recorder = desk.recorder()
+    publish(desk.memory, 20)
+    recorder.step(flush=True)
+    own = files(tmp_path, OTHER, 1, 2)
+    assert prune(tmp_path, OTHER, 0.0) == own
+    publish(desk.memory, 10)
+    recorder.close()
+    assert numbers(desk.stem) == list(range(30))
+    written = desk.files
+    assert prune(tmp_path, OTHER, 0.0) == written  # nobody writes them any more
+
+
+def test_a_file_that_another_daemon_has_removed_is_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (kept,) = files(tmp_path, SESSION, 1)
+    listed = [(SESSION, 1, kept), (SESSION, 2, tmp_path / f"{SESSION}-002.mcap")]
+    monkeypatch.setattr(folder_module, "recordings", lambda folder: listed)
+    assert prune(tmp_path, OTHER, 0.0) == [kept]
+
+
+def test_daemons_that_begin_in_the_same_second_take_two_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = datetime(2026, 3, 1, 12, 30, 5).timestamp()
+    stem = f"{datetime.fromtimestamp(begin):run-%Y%m%d-%H%M%S}"
+    other = tmp_path / f"{stem}.loop.log"
+
+    def looks_while_the_other_begins(folder: Path, session: str) -> list[Path]:
+        if session == stem:
+            other.write_bytes(b"output of the other daemon")
+        return []
+
+    monkeypatch.setattr(folder_module, "segments", looks_while_the_other_begins)
+    assert new_session(tmp_path, begin) == f"{stem}-2"
+    assert other.read_bytes() == b"output of the other daemon"
+    assert (tmp_path / f"{stem}-2.loop.log").exists()
