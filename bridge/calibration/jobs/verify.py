@@ -16,8 +16,7 @@ from gapbridge.bridge.calibration.format import (
     quantity_text,
     verdict_text,
 )
-from gapbridge.bridge.calibration.jobs.calibrate import baseline_path
-from gapbridge.bridge.calibration.jobs.job import Job, short_plan, write_log
+from gapbridge.bridge.calibration.jobs.job import Job, baseline_path, short_plan, write_log
 from gapbridge.bridge.calibration.planning import (
     loads_of,
     metrology_of,
