@@ -77,6 +77,7 @@ class Reason(Enum):
     EPISODES = auto()  # how many, s between two
     MIDDLE_ZERO = auto()
     BEHIND_GEARS = auto()
+    MISSING = auto()  # rows, column
     DAMAGED = auto()  # file, first byte, bytes
 
 

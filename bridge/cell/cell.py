@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from gapbridge.bridge.cell.document import read_document
+from gapbridge.bridge.cell.document import parse, read_document
 from gapbridge.bridge.cell.effects import compliance_terms, effect_terms
 from gapbridge.bridge.cell.message import error_lines, located, located_message, message_at
 from gapbridge.bridge.cell.plausibility import check_plausibility
@@ -170,8 +170,15 @@ def load_cell(path: Path | str) -> Cell:
     Raises CellError (or ArmError) with one line that names the file, the line, the key, the value
     found and the value expected.
     """
-    path = Path(path)
-    document = read_document(path)
+    return _cell_of(read_document(Path(path)))
+
+
+def cell_of(text: str, path: Path) -> Cell:
+    """Return the cell that a text will be at ``path``; raises as ``load_cell`` does."""
+    return _cell_of(parse(text, path))
+
+
+def _cell_of(document: Document) -> Cell:
     try:
         file = _validated(document)
     except ValidationError as error:

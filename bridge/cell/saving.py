@@ -48,9 +48,7 @@ def save_cell(
     file's folder. Reading the new file gives exactly the same model.
     """
     path = Path(path)
-    model = model or cell.model
-    text = cell_text(cell, path, model, _changed_tool(cell, model) | (sections or {}))
-    write_text(path, text)
+    write_text(path, cell_text(cell, path, model or cell.model, sections))
 
 
 def _changed_tool(cell: Cell, model: Model) -> dict[str, Any]:
@@ -66,7 +64,7 @@ def _changed_tool(cell: Cell, model: Model) -> dict[str, Any]:
 def cell_text(cell: Cell, path: Path, model: Model, sections: dict[str, Any] | None = None) -> str:
     """Return the text of the cell file at ``path`` for ``model``; see save_cell."""
     document = cell.document
-    changes: dict[str, Any] = {**(sections or {})}
+    changes: dict[str, Any] = _changed_tool(cell, model) | (sections or {})
     changes["compliance"] = compliance_entry(model.terms, model.arm.n)
     entries = effect_entries(model.terms, model.arm)
     if entries or "effects" in document.data:

@@ -97,6 +97,7 @@ TEXTS = {
     Reason.MIDDLE_ZERO: "a joint's zero is the middle of its calibrated range, not the model's",
     Reason.BEHIND_GEARS: "actual_current_as_torque is tau_J: measured behind the gears, without "
     "the motor's friction and inertia",
+    Reason.MISSING: "{0} rows without a value of {1}",
     Reason.DAMAGED: "{0}: chunk at byte {1} is damaged: {2} bytes were left out",
 }
 

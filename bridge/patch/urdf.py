@@ -130,24 +130,25 @@ class _Document:
         ``inside``: the child element that contains <tag>; '': <tag> is a direct child.
         """
         with_type = r"(?=[^>]*\btype\s*=)" if kind == "joint" else ""  # no transmission's joint
+        visible = _without_comments(self.text)
         block = re.search(
             rf"<{kind}\b{with_type}[^>]*\bname\s*=\s*([\"']){re.escape(name)}\1[^>]*>.*?</{kind}>",
-            self.text, re.DOTALL,
+            visible, re.DOTALL,
         )  # fmt: skip
         assert block is not None, f"{kind} {name}"
         begin, end = block.span()
         if inside:
-            part = re.search(rf"<{inside}\b[^>]*>.*?</{inside}>", _without_comments(block[0]),
-                             re.DOTALL)  # fmt: skip
+            part = re.search(rf"<{inside}\b[^>]*>.*?</{inside}>", block[0], re.DOTALL)
             assert part is not None, f"{name}: {inside}"
             begin, end, kind = begin + part.start(), begin + part.end(), inside
         text = self.text[begin:end]
         numbers = {key: " ".join(f"{v:.17g}" for v in np.atleast_1d(value))
                    for key, value in values.items()}  # fmt: skip
-        element = re.search(rf"<{tag}\b[^>]*?/?>", _without_comments(text))
+        element = re.search(rf"<{tag}\b[^>]*?/?>", visible[begin:end])
         if element is None:
             attributes = " ".join(f'{key}="{value}"' for key, value in numbers.items())
-            rewritten = text.replace(f"</{kind}>", f"  <{tag} {attributes}/>\n  </{kind}>")
+            closing = f"</{kind}>"
+            rewritten = f"{text.removesuffix(closing)}  <{tag} {attributes}/>\n  {closing}"
         else:
             old = written = element[0]
             for key, value in numbers.items():
@@ -163,9 +164,9 @@ class _Document:
     def comment(self, lines: Sequence[str]) -> None:
         """Insert lines as a comment at the start of <robot>."""
         text = "\n       ".join(line.replace("--", "- -") for line in lines)
-        self.text = re.sub(
-            r"(<robot\b[^>]*>)", lambda tag: f"{tag[1]}\n  <!-- {text} -->", self.text, count=1
-        )
+        robot = re.search(r"<robot\b[^>]*>", _without_comments(self.text))
+        assert robot is not None
+        self.text = f"{self.text[: robot.end()]}\n  <!-- {text} -->{self.text[robot.end() :]}"
 
 
 def _without_comments(text: str) -> str:

@@ -32,7 +32,7 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from gapbridge.bridge.recording.folder import NAME
+from gapbridge.bridge.recording.folder import recordings
 from gapbridge.core.errors import LogError
 from gapbridge.core.log import mcap_records as records
 from gapbridge.core.log.mcap_reading import files_of
@@ -147,9 +147,9 @@ def unfinished(folder: Path) -> list[Path]:
     """Return the recordings of a folder that have no summary, oldest first; never raises."""
     paths = []
     with contextlib.suppress(OSError):
-        for path in sorted(folder.iterdir()):
+        for _, _, path in recordings(folder):
             with contextlib.suppress(OSError):
-                if NAME.match(path.name) and path.is_file() and not records.is_whole(path):
+                if path.is_file() and not records.is_whole(path):
                     paths.append(path)
     return paths
 

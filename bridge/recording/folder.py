@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import re
 from datetime import datetime
 from pathlib import Path
 
+from gapbridge.bridge.document.output_file import private
 from gapbridge.core.log.mcap_reading import SUFFIX, last_batch
 
 NAME = re.compile(r"(?P<session>.+)-(?P<number>\d{3,})\.mcap$")
@@ -15,33 +17,46 @@ MB = 1e6
 
 
 def new_session(folder: Path | None, begin: float) -> str:
-    """Return an unused name for a run that begins at ``begin`` (s since 1970).
+    """Return an unused name for a run that begins at ``begin`` (s since 1970), and take it.
 
-    run-YYYYmmdd-HHMMSS in local time, with a number after it where that is taken.
+    run-YYYYmmdd-HHMMSS in local time, with a number after it where that is taken. The name is taken
+    by its loop log, so that no other daemon gets it. Raises OSError where that cannot be created.
     """
     stem, number = f"{datetime.fromtimestamp(begin):run-%Y%m%d-%H%M%S}", 1
     name = stem
-    while folder is not None and _is_taken(folder, name):
+    while folder is not None and not _take(folder, name):
         number += 1
         name = f"{stem}-{number}"
     return name
 
 
-def _is_taken(folder: Path, session: str) -> bool:
-    return bool(segments(folder, session)) or (folder / f"{session}{LOOP_LOG}").exists()
+def _take(folder: Path, session: str) -> bool:
+    """Create the loop log of a run; returns whether the name was free."""
+    if segments(folder, session):
+        return False
+    try:
+        with open(folder / f"{session}{LOOP_LOG}", "xb", opener=private):
+            return True
+    except FileExistsError:
+        return False
+
+
+def recordings(folder: Path) -> list[tuple[str, int, Path]]:
+    """Return run, number and path of each file that a recorder named, in this order.
+
+    Names alone do not order them: -1000.mcap sorts before -999.mcap. Raises OSError.
+    """
+    matches = [(path, NAME.match(path.name)) for path in folder.iterdir()]
+    return sorted(
+        (match["session"], int(match["number"]), path) for path, match in matches if match
+    )
 
 
 def segments(folder: Path, session: str) -> list[Path]:
     """Return the files of a run, in order."""
     if not folder.is_dir():
         return []
-    matches = [(path, NAME.match(path.name)) for path in folder.iterdir()]
-    numbered = [
-        (int(match["number"]), path)
-        for path, match in matches
-        if match and match["session"] == session
-    ]
-    return [path for _, path in sorted(numbered)]
+    return [path for name, _, path in recordings(folder) if name == session]
 
 
 def next_path(folder: Path, session: str) -> Path:
@@ -61,23 +76,45 @@ def prune(folder: Path, session: str, keep_total: float | None) -> list[Path]:
     """Remove the oldest files until recordings take no more than ``keep_total`` MB; return them.
 
     Files of other runs are removed first, then this run's oldest. Only files named by a recorder
-    are removed. Raises nothing: files that cannot be removed are kept.
+    are removed, and none that one is writing: several daemons may share a folder. Raises nothing:
+    files that cannot be removed are kept.
     """
     if keep_total is None:
         return []
-    files = [path for path in folder.iterdir() if NAME.match(path.name)]
-    sizes = {path: path.stat().st_size for path in files if path.is_file()}
-    total, gone = sum(sizes.values()), []
-    oldest = sorted(sizes, key=lambda path: (path.name.startswith(f"{session}-"), path.name))
-    for path in oldest:
+    sizes = _sizes(folder)
+    total, gone = sum(sizes.values()), {}
+    for name, path in sorted(sizes, key=lambda file: file[0] == session):  # keeps their order
         if total <= keep_total * MB:
             break
         with contextlib.suppress(OSError):
-            path.unlink()
-            total -= sizes[path]
-            gone.append(path)
-    for name in {match["session"] for path in gone if (match := NAME.match(path.name))}:
+            if _remove(path):
+                total -= sizes[name, path]
+                gone[path] = name
+    for name in set(gone.values()):
         if name != session and not segments(folder, name):
             with contextlib.suppress(OSError):
                 (folder / f"{name}{LOOP_LOG}").unlink()
-    return gone
+    return list(gone)
+
+
+def _sizes(folder: Path) -> dict[tuple[str, Path], int]:
+    """Return bytes by run and path, in the order of ``recordings``."""
+    sizes = {}
+    for name, _, path in recordings(folder):
+        with contextlib.suppress(OSError):  # another daemon has removed it
+            if path.is_file():
+                sizes[name, path] = path.stat().st_size
+    return sizes
+
+
+def _remove(path: Path) -> bool:
+    """Remove a file unless its recorder holds its lock; returns whether it was removed."""
+    with path.open("r+b") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:  # a file system without locks: no recorder could take one either
+            pass
+        path.unlink()
+    return True

@@ -178,6 +178,7 @@ class Recorder:
             self._describe()
             self._segment.flush()
         except OSError as error:
+            self._discard()
             self._pause(error.strerror or str(error))
             return False
         self._pause_reason = ""
@@ -185,6 +186,14 @@ class Recorder:
         self._flushed = self._clock.monotonic()
         self._report(f"recording into {path}", file=str(path))
         return True
+
+    def _discard(self) -> None:
+        """Remove a file whose head could not be written: each retry would leave another one."""
+        if self._segment is not None:
+            self._segment.abandon()
+            with contextlib.suppress(OSError):
+                self._segment.path.unlink()
+        self._segment = None
 
     def _describe(self) -> None:
         assert self._segment is not None

@@ -45,13 +45,15 @@ class PayloadCalibration:
     notes: tuple[Note, ...]
 
     def applied(self, model: Model) -> Model:
-        """Return the model with this payload and bias, instead of its own."""
+        """Return the model with this payload and bias, instead of its own.
+
+        Where nothing weighs, the payload is none: the estimate may be just below 0 kg.
+        """
+        mass = 0.0 if Note(Reason.NOTHING_WEIGHS) in self.notes else self.mass
         replaced = (*correcting("payload"), BIAS)
         kept = tuple(t for t in model.terms if t.effect not in replaced)
         bias = Term(BIAS, Site(), tuple(float(v) for v in self.bias))
-        return replace(
-            model, payload_mass=self.mass, payload_cog=self.cog.copy(), terms=(*kept, bias)
-        )
+        return replace(model, payload_mass=mass, payload_cog=self.cog.copy(), terms=(*kept, bias))
 
 
 def weight_columns(model: Model, q: Array) -> Array:

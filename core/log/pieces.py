@@ -6,7 +6,7 @@ the rows before (the last motion of a joint) is carried over.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import dropwhile, islice
 from pathlib import Path
@@ -29,6 +29,7 @@ from gapbridge.core.log.log import (
     table_columns,
 )
 from gapbridge.core.log.parquet_tables import ParquetColumns
+from gapbridge.core.notes import Note, Reason
 
 # names of all columns, values of the known ones (rows, known columns), lines where not in sequence
 Table = tuple[list[str], Array, Index | None]
@@ -44,12 +45,14 @@ class LogPieces:
     n: int  # joints
     rows: int = ROWS  # of a piece at most (a recording: of a chunk)
     motions: bool = True  # False: without the last motions, which are carried from piece to piece
+    # ``reported_columns`` of the recording that the file is a part of; None: of the file itself
+    reported: Collection[str] | None = None
 
     def __iter__(self) -> Iterator[Log]:
         """Yield the pieces in order. Raises LogError, as ``read_log`` does."""
         motion = _Motion()
         first = 2
-        for names, table, lines in _tables(self.path, self.rows):
+        for names, table, lines in self._tables():
             known = [name for name in names if is_known(name)]
             columns = table_columns(self.path, known, table, self.n)
             if not columns:
@@ -61,6 +64,19 @@ class LogPieces:
             )
             yield motion.carried(piece) if self.motions else piece
             first += len(table)
+
+    def _tables(self) -> Iterator[Table]:
+        """Yield the pieces of the file."""
+        path = self.path
+        if not path.is_file():
+            raise no_file(path)
+        if path.suffix.lower() in PARQUET:
+            columns = ParquetColumns(path)
+            return ((columns.names, table, None) for table in columns.tables(self.rows))
+        if path.suffix.lower() == RECORDING:
+            reported = reported_columns(path) if self.reported is None else self.reported
+            return _recording(path, reported)
+        return _csv(path, self.rows, _encoding(path))
 
     def count(self) -> int:
         """Return the number of rows, from the file's metadata where it has it."""
@@ -89,18 +105,6 @@ class _Motion:
             sign = np.where(unmoved, self._sign, sign)
         self._q, self._sign = q[-1:].copy(), sign[-1].copy()
         return replace(piece, columns={**piece.columns, "approach": sign})
-
-
-def _tables(path: Path, rows: int) -> Iterator[Table]:
-    """Yield the pieces of a file."""
-    if not path.is_file():
-        raise no_file(path)
-    if path.suffix.lower() in PARQUET:
-        columns = ParquetColumns(path)
-        return ((columns.names, table, None) for table in columns.tables(rows))
-    if path.suffix.lower() == RECORDING:
-        return _recording(path)
-    return _csv(path, rows, _encoding(path))
 
 
 def column_names(path: Path) -> list[str]:
@@ -165,15 +169,48 @@ def _lines(file: Iterable[str]) -> Iterator[tuple[int, str]]:
             yield number, line
 
 
-def _recording(path: Path) -> Iterator[Table]:
+def reported_columns(recording: Path) -> dict[str, int]:
+    """Return the columns of a recording that have any value, and how many rows of each lack one.
+
+    What the controller never reported is no column. Decided for the recording as a whole: within
+    one chunk (0.4 s) a sensor may be silent. Holds one chunk at a time. Raises LogError.
+    """
+    from gapbridge.core.log.mcap_reading import read_batches
+
+    missing: dict[str, int] = {}
+    carried: set[str] = set()
+    for batch in read_batches(recording):
+        columns = _known(batch.columns)
+        carried.update(name for name in columns if _has_values(columns[name]))
+        if any(map(_has_values, columns.values())):  # others are no rows of the log
+            for name, values in columns.items():
+                without = np.isnan(values).reshape(len(values), -1).any(axis=1)
+                missing[name] = missing.get(name, 0) + int(without.sum())
+    return {name: rows for name, rows in missing.items() if name in carried}
+
+
+def missing_values(reported: Mapping[str, int]) -> tuple[Note, ...]:
+    """Return a note for each of ``reported_columns`` that lacks values."""
+    return tuple(Note(Reason.MISSING, (rows, name)) for name, rows in reported.items() if rows)
+
+
+def _known(columns: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the fields of a recording that are columns of a log."""
+    return {
+        name: values
+        for name, values in columns.items()
+        if is_known(next(iter(scalars({name: values}))))
+    }
+
+
+def _has_values(values: Array) -> bool:
+    return not np.isnan(values).all()
+
+
+def _recording(path: Path, reported: Collection[str]) -> Iterator[Table]:
     from gapbridge.core.log.mcap_reading import read_batches
 
     for batch in read_batches(path):
-        # what the controller never reported is no column
-        reported = {
-            name: values
-            for name, values in batch.columns.items()
-            if is_known(next(iter(scalars({name: values})))) and not np.isnan(values).all()
-        }
-        if reported:
-            yield *as_table(reported), None
+        columns = {name: values for name, values in batch.columns.items() if name in reported}
+        if any(map(_has_values, columns.values())):
+            yield *as_table(columns), None

@@ -51,6 +51,12 @@ class Table:
 
         Raises ReadingError naming file and row, InputError for an unknown column.
         """
+        titled = self.names and self.names[0].startswith("#")  # a comment, perhaps no header
+        if self.names and len(row.cells) != len(self.names) and (columns or not titled):
+            raise ReadingError(  # which of its cells it lacks is unknown: the others would shift
+                f"{self.path}: row {row.line}: found {len(row.cells)} cells, expected "
+                f"{len(self.names)} as in the header"
+            )
         cells = row.cells[-count:] if columns is None else self._select(row, columns)
         try:
             return parse_numbers(";".join(cells), count)
@@ -70,10 +76,10 @@ class Table:
 def read_table(path: Path, growing: bool = True) -> Table:
     """Return the complete lines of a file; of a ``growing`` one without an unterminated last line.
 
-    Raises InputError if it cannot be read, is no UTF-8, or a stop is no whole number.
+    Raises InputError if it cannot be read, is no UTF-8 or no CSV, or a stop is no whole number.
     """
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
         raise InputError(f"{path}: found bytes that are no text, expected CSV (UTF-8)") from None
     except OSError as error:
@@ -81,17 +87,28 @@ def read_table(path: Path, growing: bool = True) -> Table:
     complete = text[: text.rfind("\n") + 1] if growing else text
     first = complete.split("\n", 1)[0]
     separator = max(";\t,", key=first.count) if any(c in first for c in ";\t,") else " "
-    lines = list(csv.reader(io.StringIO(complete), delimiter=separator, skipinitialspace=True))
+    try:
+        lines = list(csv.reader(io.StringIO(complete), delimiter=separator, skipinitialspace=True))
+    except csv.Error as error:
+        raise InputError(f"{path}: found {error}, expected CSV") from None
     has_header = bool(lines) and any(not _is_number(c) for c in lines[0] if c.strip())
-    names = tuple(c.strip() for c in lines[0]) if has_header else ()
+    names = _cells(lines[0], 0) if has_header else ()
     stop_index = names.index(STOP_COLUMN) if STOP_COLUMN in names else None
     rows = []
     for i, cells in enumerate(lines[len(names) and 1 :], 1 + bool(names)):
-        kept = tuple(c.strip() for c in cells if c.strip() or names)
+        kept = _cells(cells, len(names)) if names else tuple(c.strip() for c in cells if c.strip())
         if not any(kept) or kept[0].startswith("#"):
             continue
         rows.append(Row(i, kept, _stop(path, i, kept, stop_index)))
     return Table(path, names, tuple(rows))
+
+
+def _cells(cells: list[str], count: int) -> tuple[str, ...]:
+    """Return the cells of a row, without empty ones beyond ``count``: a separator at its end."""
+    kept = [cell.strip() for cell in cells]
+    while len(kept) > count and not kept[-1]:
+        kept.pop()
+    return tuple(kept)
 
 
 def _stop(path: Path, line: int, cells: tuple[str, ...], index: int | None) -> int | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -16,15 +15,15 @@ from gapbridge.bridge.calibration.format import (
     number_text,
     quantity_text,
 )
-from gapbridge.bridge.calibration.jobs.job import Job, write_document, write_log
+from gapbridge.bridge.calibration.jobs.job import Job, document_text, write_log
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import effects_of, make_plan, metrology_of, observable_of
 from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.session import Session, seconds_left
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cell.verification_mark import remove_mark
 from gapbridge.bridge.document.notes import calibration_text, note_text
 from gapbridge.bridge.document.numbers import unit_of
+from gapbridge.bridge.document.output_file import write_text
 from gapbridge.bridge.document.provenance import fitted as fit_provenance
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.arrays import Array
@@ -43,11 +42,6 @@ from gapbridge.core.log.log import read_log
 MAX_REFITS = 3  # with effects that the first fit lacks
 MIN_REPEATABILITY = 2e-6  # m, below which it is not given
 DIAGNOSABLE_KINDS = ("position", "pose")  # kinds of readings whose residual can be diagnosed
-
-
-def baseline_path(cell: Path) -> Path:
-    """Return the path of a calibrated cell's accuracy baseline."""
-    return cell.with_name(f"{cell.stem}.promise.json")
 
 
 class CalibrationJob(Job):
@@ -153,7 +147,7 @@ class CalibrationJob(Job):
         origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
         baseline = baseline_document(result, sigma=metrology.sigma)
         baseline |= {"verdict": calibration_text(result), "provenance": origin}
-        write_document(folder / "promise.json", baseline)
+        write_text(folder / "promise.json", document_text(baseline))
         from gapbridge.bridge.calibration.jobs.facts import (
             session_facts,  # plotting is slow to import
         )
@@ -172,10 +166,8 @@ class CalibrationJob(Job):
         spread = Spread(tuple(e.name for e in result.estimates), result.whole_covariance)
         intervals = self.cell.intervals | {e.name: e.interval for e in result.estimates if e.shown}
         sections = {"provenance": fit_provenance(origin, range_of(log), spread, intervals)}
-        target = self.write_new_cell(result.model, "the calibrated cell", sections)
+        target = self.write_new_cell(result.model, "the calibrated cell", sections, baseline)
         if target is not None:
-            write_document(baseline_path(target), baseline)
-            remove_mark(target)  # of the calibration that was replaced
             prompt.say(f"  months later: gapbridge calibrate {target} --verify")
 
 

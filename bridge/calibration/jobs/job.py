@@ -18,15 +18,19 @@ from gapbridge.bridge.calibration.planning import effects_of, loads_of, metrolog
 from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
-from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.cell import cell_of
+from gapbridge.bridge.cell.saving import cell_text
+from gapbridge.bridge.cell.verification_mark import remove_mark
 from gapbridge.bridge.document.notes import note_text, short_text
-from gapbridge.bridge.document.output_file import require_writable, write_table, write_text
+from gapbridge.bridge.document.output_file import require_writable, write_table, write_together
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.tool_session import ToolCalibration
+from gapbridge.core.errors import InputError, RunError
 from gapbridge.core.log.columns import as_table
 from gapbridge.core.model import Model
 
@@ -94,9 +98,14 @@ class Job(ABC):
             prompt.say(f"{file}: written")
 
     def write_new_cell(
-        self, model: Model, what: str, sections: dict[str, Any] | None = None
-    ) -> Path | None:
-        """Ask, and write a new cell; the old one is kept. Returns its path, None if declined."""
+        self, model: Model, what: str, sections: dict[str, Any] | None = None,
+        baseline: dict[str, Any] | None = None,
+    ) -> Path | None:  # fmt: skip
+        """Ask, and write a new cell; the old one is kept. Returns its path, None if declined.
+
+        ``baseline``: its accuracy baseline, written together with it. Raises RunError where the
+        cell could not be loaded; then nothing is written.
+        """
         cell, prompt = self.cell, self.prompt
         stem = cell.path.with_name(f"{cell.path.stem}_{self.suffix}{cell.path.suffix}")
         target = self.options.new_cell or _unused_path(stem)
@@ -113,7 +122,17 @@ class Job(ABC):
         if kept is not None:  # the provenance of fitted parameters is kept
             kept_keys = {"fitted", "parameters", "covariance"}
             origin |= kept.model_dump(mode="json", include=kept_keys)
-        save_cell(cell, target, model, {"provenance": origin} | (sections or {}))
+        text = cell_text(cell, target, model, {"provenance": origin} | (sections or {}))
+        try:
+            cell_of(text, target)
+        except InputError as error:
+            raise RunError(f"nothing is written, the cell could not be loaded: {error}") from None
+        # the baseline first: were only it replaced, the old cell would fail its verification
+        beside = {} if baseline is None else {baseline_path(target): document_text(baseline)}
+        write_together({**beside, target: text})
+        if baseline is not None:
+            remove_mark(target)  # of the calibration that was replaced
+        # last: a session that could not write all of it has not ended
         self.session.add("ended", applied=str(target.resolve()))
         prompt.say(f"{target}: written", "bold")
         return target
@@ -129,9 +148,14 @@ def short_plan(
     return Plan(loads, tuple(poses), expected, tuple(bought), 0.0)
 
 
-def write_document(path: Path, document: dict[str, Any]) -> None:
-    """Write a document as JSON."""
-    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+def baseline_path(cell: Path) -> Path:
+    """Return the path of a calibrated cell's accuracy baseline."""
+    return cell.with_name(f"{cell.stem}.promise.json")
+
+
+def document_text(document: dict[str, Any]) -> str:
+    """Return a document as JSON."""
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
 def _modified_text(path: Path) -> str:

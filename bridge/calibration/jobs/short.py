@@ -21,10 +21,12 @@ from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.settings.instruments import Base, PointSettings
+from gapbridge.bridge.document.notes import note_text
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import calibrate_payload
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.calibration.tool_session import calibrate_tool
+from gapbridge.core.notes import Reason
 from gapbridge.core.planning.payload_plan import plan_payload
 from gapbridge.core.planning.tool_plan import plan_tool
 from gapbridge.core.rotation import roll_pitch_yaw
@@ -151,7 +153,11 @@ class PayloadJob(_ShortJob):
             for e in result.estimates
         ]
         self.report_short(result, lines, ("the force sensor of the flange", "wrench"))
-        payload = {"mass": result.mass, "cog": [float(v) for v in result.cog]}
-        self.write_new_cell(
-            result.applied(self.cell.model), "the cell with this load", {"payload": payload}
-        )
+        negative = [note for note in result.notes if note.reason is Reason.NEGATIVE_MASS]
+        if negative:
+            self.session.add("ended", applied=None)
+            self.prompt.warn(f"nothing is applied: {note_text(negative[0])}")
+            return
+        applied = result.applied(self.cell.model)
+        payload = {"mass": applied.payload_mass, "cog": [float(v) for v in applied.payload_cog]}
+        self.write_new_cell(applied, "the cell with this load", {"payload": payload})

@@ -16,8 +16,7 @@ from gapbridge.bridge.calibration.format import (
     quantity_text,
     verdict_text,
 )
-from gapbridge.bridge.calibration.jobs.calibrate import baseline_path
-from gapbridge.bridge.calibration.jobs.job import Job, short_plan, write_log
+from gapbridge.bridge.calibration.jobs.job import Job, baseline_path, short_plan, write_log
 from gapbridge.bridge.calibration.planning import (
     loads_of,
     metrology_of,
@@ -109,6 +108,8 @@ class VerifyJob(Job):
                 self.cell.model, readings, self._baseline(), metrology,
                 observable=observable_of(self.cell, options.instrument, places),
             )  # fmt: skip
+        if not self.session.has_ended:
+            self._mark(verification)  # first: whatever fails below, the daemon must not arm
         prompt.say()
         self._report(verification)
         write_log(readings, metrology.registered, folder / "readings.csv")
@@ -120,8 +121,6 @@ class VerifyJob(Job):
             prompt.say(f"{file}: written")
         moved = None if verification.moved is None else verification.moved.name
         others = [other.name for other in verification.alternatives]
-        if not self.session.has_ended:
-            self._mark(verification)  # first: a session that could not mark has not ended
         self.session.add("ended", holds=verification.holds, moved=moved, or_else=others)
         if not verification.holds:
             raise VerificationError(f"{self.cell.path}: {verdict_text(verification)}")

@@ -297,6 +297,12 @@ class Measuring:
         if not self._measured_here():
             self.prompt.say("  no reading was taken at the present position: it needs no new one")
             return
+        if self.reading_check is None:  # a short session, whose fit knows one place only
+            self.prompt.warn(
+                "all readings of this session have to be of one place: put it back and measure "
+                f"again what was read since, or begin a new session; `{what}` is not noted"
+            )
+            return
         station = session.station + (what == "moved")
         target = session.target + (what == "slipped")
         session.add("moved", station=station, target=target, since=since)

@@ -12,7 +12,13 @@ from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import PARQUET
 from gapbridge.core.log.log import Log
-from gapbridge.core.log.pieces import ROWS, LogPieces, column_names
+from gapbridge.core.log.pieces import (
+    ROWS,
+    LogPieces,
+    column_names,
+    missing_values,
+    reported_columns,
+)
 from gapbridge.core.log.sources import source_of
 from gapbridge.core.log.sources.recording import Recording
 
@@ -32,14 +38,15 @@ class LargeLog:
 
     def __iter__(self) -> Iterator[Log]:
         """Yield the pieces. Raises LogError, as ``open_log`` does."""
-        files = [self.path]
+        files, reported = [self.path], None
         if source_of(self.path) is not None:
             from gapbridge.core.log.mcap_reading import damages, files_of  # imports protobuf
 
             files = files_of(self.path)
-            show_notes(self.path, damages(self.path))
+            reported = reported_columns(self.path)
+            show_notes(self.path, (*damages(self.path), *missing_values(reported)))
         for file in files:
-            for piece in LogPieces(file, self.cell.arm.n, self.rows, self.motions):
+            for piece in LogPieces(file, self.cell.arm.n, self.rows, self.motions, reported):
                 check_log(piece, self.cell)
                 yield piece
 

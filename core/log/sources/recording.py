@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gapbridge.core.errors import LogError
-from gapbridge.core.log.pieces import RECORDING, LogPieces
+from gapbridge.core.log.pieces import RECORDING, LogPieces, missing_values, reported_columns
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 
 
@@ -34,7 +34,10 @@ class Recording(Source):
         from gapbridge.core.log.mcap_reading import damages, files_of
 
         n = len(arm_joints) or _joints(path)
-        pieces = [piece for file in files_of(path) for piece in LogPieces(file, n)]
+        reported = reported_columns(path)
+        pieces = [
+            piece for file in files_of(path) for piece in LogPieces(file, n, reported=reported)
+        ]
         if not pieces:
             raise LogError(
                 f"{path}: found no cycles, expected a recording of gapbridge run, or an MCAP file "
@@ -42,7 +45,8 @@ class Recording(Source):
             )
         names = set.intersection(*(set(piece.columns) for piece in pieces)) - {"approach"}
         columns = {name: np.concatenate([p.columns[name] for p in pieces]) for name in names}
-        return Converted(columns, tuple(f"joint_{i + 1}" for i in range(n)), damages(path))
+        joints = tuple(f"joint_{i + 1}" for i in range(n))
+        return Converted(columns, joints, (*damages(path), *missing_values(reported)))
 
 
 def _joints(path: Path) -> int:

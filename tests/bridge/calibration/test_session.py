@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,11 @@ from scripted_session import (
     write_cell,
 )
 
+from gapbridge.bridge.calibration.jobs import verify as verify_module
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.verification_mark import read_mark
+from gapbridge.core.errors import RunError
 
 GAUGE = "{kind: dial_gauge, unit: mm}\n  instrument_at: [1, 0, 1]"
 
@@ -275,6 +278,27 @@ def test_a_verification_accepts_the_arm_and_detects_a_bent_tool(
         if bend:  # an old session that is evaluated again says nothing of the arm today
             assert run_calibrate(cell, "--verify", "--session", tmp_path / "a").code == 0
             assert "the tool moved by" in read_mark(cell)
+
+
+def test_a_failed_verification_marks_the_cell_even_where_its_files_cannot_be_written(
+    clean: tuple[Path, CommandResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell, session = tmp_path / "new.yaml", tmp_path / "s"
+    for name in ("new.yaml", "new.promise.json"):
+        shutil.copy(clean[0] / name, tmp_path / name)
+    assert run_calibrate(cell, "--verify", "--plan-only", "--session", session).code == 0
+    plan = plan_in(session)
+    lines = session_lines(plan, [reading_line(v) for v in _verified(plan, 0.004)])
+
+    def full(readings: object, registered: bool, path: Path) -> None:
+        raise RunError(f"{path}: cannot be written: No space left on device")
+
+    monkeypatch.setattr(verify_module, "write_log", full)
+    lines = [part for line in lines for part in ([line, "keep"] if line else [line])]
+    result = run_calibrate(cell, "--verify", "--session", session, lines=lines)
+    assert result.code == 1
+    assert "No space left" in result.err
+    assert "the tool moved by" in read_mark(cell)
 
 
 def _verified(plan: object, bend: float) -> np.ndarray:

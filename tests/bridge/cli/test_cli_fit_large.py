@@ -54,9 +54,7 @@ def test_a_large_log_gives_what_it_gives_in_one_piece(tmp_path, monkeypatch):
     whole = gapbridge("fit", log, "--cell", cell, "--out", tmp_path / "whole.yaml")
     assert whole.code == 0, whole.err
     monkeypatch.setattr(large_log, "LARGE_ROWS", 500)
-    monkeypatch.setattr(
-        large_log, "LogPieces", lambda path, n, rows=0, motions=True: LogPieces(path, n, 200)
-    )
+    monkeypatch.setattr(large_log, "LogPieces", lambda path, n, *_: LogPieces(path, n, 200))
     parts = gapbridge("fit", log, "--cell", cell, "--out", tmp_path / "parts.yaml")
     assert parts.code == 0, parts.err
     one, other = (load_cell(tmp_path / f"{name}.yaml").model for name in ("whole", "parts"))
@@ -83,9 +81,7 @@ def test_a_log_in_pieces_is_predicted_and_compensated_as_one(
         assert result.code == 0, result.err
         found.append((result.out.replace(name, ""), result.err, read_table(out)))
         monkeypatch.setattr(large_log, "LARGE_ROWS", 500)
-        monkeypatch.setattr(
-            large_log, "LogPieces", lambda path, n, rows=0, motions=True: LogPieces(path, n, 200)
-        )
+        monkeypatch.setattr(large_log, "LogPieces", lambda path, n, *_: LogPieces(path, n, 200))
     (said, warned, whole), (said_too, warned_too, parts) = found
     assert (said, warned) == (said_too, warned_too)
     assert "9 of 900 rows lie outside" in warned
@@ -105,9 +101,7 @@ def test_a_row_without_equilibrium_is_named_by_its_line_in_any_piece(tmp_path, m
             assert "log.parquet: row 642: the arm finds no equilibrium" in text
             assert not (tmp_path / "new.csv").exists()
         monkeypatch.setattr(large_log, "LARGE_ROWS", 500)
-        monkeypatch.setattr(
-            large_log, "LogPieces", lambda path, n, rows=0, motions=True: LogPieces(path, n, 200)
-        )
+        monkeypatch.setattr(large_log, "LogPieces", lambda path, n, *_: LogPieces(path, n, 200))
 
 
 def test_a_fault_far_down_a_large_log_names_its_row(tmp_path, monkeypatch):

@@ -22,6 +22,9 @@ from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.log import read_log
 from gapbridge.core.log.mcap_reading import last_batch, read_batches
 from gapbridge.core.log.mcap_records import chunk_offsets
+from gapbridge.core.log.sources.recording import Recording
+from gapbridge.core.log.sources.source import SourceOptions
+from gapbridge.core.notes import Note, Reason
 
 
 @pytest.fixture
@@ -155,6 +158,41 @@ def test_a_recording_read_in_pieces_tells_what_is_damaged(
     with contextlib.suppress(LogError):  # its numbers are no arm's
         next(iter(LargeLog(path, load_cell(cell))))
     assert re.search(rf"note: {re.escape(str(path))}: .*is damaged: ", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("segment_size", [256.0, 0.001])
+def test_a_column_without_a_value_for_a_whole_chunk_or_file_stays_and_is_noted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], segment_size: float
+) -> None:
+    desk = Desk(tmp_path / "recordings", segment_size=segment_size)
+    recorder, memory = desk.recorder(), desk.memory
+    for chunk in range(4):
+        for _ in range(10):
+            row = memory.next_row()
+            row[1:] = 0.1
+            row[memory.slices["timestamp"]] = 0.002 * memory.written
+            row[memory.slices["joint_temperatures"]] = np.nan  # never reported
+            if chunk == 2:
+                row[memory.slices["ft_raw_wrench"]] = np.nan
+            memory.publish()
+        recorder.step(flush=True)
+    recorder.close()
+    assert (len(desk.files) > 3) is (segment_size < 1)
+    found = Recording().read(desk.stem, (), SourceOptions())
+    silent = np.isnan(found.columns["ft_raw_wrench"]).all(axis=1)
+    assert list(np.flatnonzero(silent)) == list(range(20, 30))
+    assert not np.isnan(found.columns["actual_q"]).any()
+    assert "joint_temperatures" not in found.columns
+    assert found.notes == (Note(Reason.MISSING, (10, "ft_raw_wrench")),)
+    cell = tmp_path / "cell.yaml"
+    cell.write_text("robot: {model: ur10e}\n")
+    pieces = list(LargeLog(desk.stem, load_cell(cell)))
+    assert [len(piece) for piece in pieces] == [10] * 4
+    assert {tuple(sorted(piece.columns)) for piece in pieces} == {
+        tuple(sorted({*found.columns, "approach"}))
+    }
+    note = f"note: {desk.stem}: 10 rows without a value of ft_raw_wrench\n"
+    assert capsys.readouterr().err == note
 
 
 def test_the_command_writes_beside_the_recording_and_gives_the_cell_back(

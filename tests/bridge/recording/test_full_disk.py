@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
 import resource
@@ -93,6 +94,26 @@ def test_a_disk_that_stays_full_is_reported_once_and_what_is_lost_is_counted(
     assert recorder.lost == 100
     assert sum("paused" in event for event in desk.events) == 1
     assert numbers(desk.files[0]) == list(range(20))
+    assert len(desk.files) == 1  # and no empty one for each retry
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_file_whose_head_cannot_be_synced_is_not_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(fd: int) -> None:
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    desk = Desk(tmp_path)
+    recorder = desk.recorder()
+    with monkeypatch.context() as quota:
+        quota.setattr(os, "fdatasync", refused)
+        for _ in range(3):
+            publish(desk.memory, 10)
+            recorder.step()
+    assert not desk.files
+    recorder.close()
+    assert numbers(desk.stem) == list(range(30))
 
 
 @pytest.mark.usefixtures("quick")

@@ -260,6 +260,7 @@ def test_a_session_is_named_anew_while_its_name_is_taken(tmp_path: Path) -> None
         name = new_session(tmp_path, begin)
         names.add(name)
         (tmp_path / f"{name}-001.mcap").touch()
+        (tmp_path / f"{name}.loop.log").unlink()  # its files take the name too
     assert len(names) == 3
     assert new_session(None, begin) == "run-20260301-123005"
 

@@ -151,12 +151,43 @@ def test_a_file_with_stops_gives_each_stop_its_last_row(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "phrase"),
-    [("1,2\n", "row 1: found 2 numbers"), ("x,y,z\n1,2,q\n", "row 2: found 'q'")],
+    [
+        ("1,2\n", "row 1: found 2 numbers"),
+        ("x,y,z\n1,2,q\n", "row 2: found 'q'"),
+        ("n,x,y,z\n1,100,200\n", "row 2: found 3 cells, expected 4 as in the header"),
+        ("x,y,z\n1,5,2,5,3,5\n", "row 2: found 6 cells, expected 3"),
+    ],
 )
 def test_a_bad_row_is_named(tmp_path: Path, text: str, phrase: str) -> None:
     file = tmp_path / "readings.csv"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ReadingError, match=phrase):
+        instrument("file", unit="m", file=str(file)).read(ReadRequest())
+
+
+def test_a_row_too_short_for_its_named_columns_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "readings.csv"
+    file.write_text("n,x,y,z\n1,100,200\n", encoding="utf-8")
+    reader = instrument("file", columns=("x", "y", "z"), unit="m", file=str(file))
+    with pytest.raises(ReadingError, match=r"readings\.csv: row 2: found 3 cells"):
+        reader.read(ReadRequest())
+
+
+@pytest.mark.parametrize(
+    "text", ["x,y,z\r1,2,3\r", "x,y,z\r\n1,2,3\r\n", "x,y,z\n1,2,3,\n", "x,y,z,\n1,2,3,\n",
+             "# of a tracker\n1,2,3\n"]
+)  # fmt: skip
+def test_line_ends_separators_at_them_and_a_title_do_not_matter(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "readings.csv"
+    file.write_bytes(text.encode())
+    found = instrument("file", unit="m", file=str(file), timeout=1.0).read(ReadRequest())
+    np.testing.assert_allclose(found.values, [[1, 2, 3]])
+
+
+def test_what_is_no_csv_is_unusable_input(tmp_path: Path) -> None:
+    file = tmp_path / "readings.csv"
+    file.write_text(f"x,y,z\n{'1' * 200_000},2,3\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"readings\.csv: found field larger"):
         instrument("file", unit="m", file=str(file)).read(ReadRequest())
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scripted_session import plan_in, run_calibrate, write_cell
 
+from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.observables import make_observable
@@ -54,6 +55,25 @@ def test_the_tip_of_a_new_tool_is_found_and_written_after_a_yes(tmp_path: Path) 
     found = load_cell(new).model.tool_in_flange
     np.testing.assert_allclose(found[:3, 3], tool[:3, 3], atol=5e-5)
     assert (session / "tool.html").exists()
+
+
+@pytest.mark.parametrize("what", ["moved", "slipped"])
+def test_a_point_that_was_moved_or_a_tip_that_slipped_needs_a_new_session(
+    tmp_path: Path, what: str
+) -> None:
+    cell, session = write_cell(tmp_path, joints="typed"), tmp_path / "s"
+    run_calibrate(cell, "--tool-only", "--plan-only", "--session", session, lines=[reported(BEGIN)])
+    first, second = (reported(pose.q) for pose in plan_in(session).poses[:2])
+    result = run_calibrate(
+        cell, "--tool-only", "--session", session,
+        lines=["", what, "", first, what, "", second, "quit"],
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    assert "no reading was taken at the present position" in result.out
+    assert f"begin a new session; `{what}` is not noted" in " ".join(result.out.split())
+    kinds = [entry["kind"] for entry in read_entries(session / FILE)]
+    assert kinds.count("reading") == 2
+    assert "moved" not in kinds
 
 
 def test_joints_in_radians_are_taken_for_a_mistake(tmp_path: Path) -> None:

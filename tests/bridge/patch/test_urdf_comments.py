@@ -1,0 +1,47 @@
+"""A patched URDF that holds an older arm in comments: they are no part of the arm."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+from benchmarks.patch.arms import UR_JOINTS, urdf
+from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.model import Model
+
+ARM = builtin_arm("ur10e")
+CHANGES = (
+    Term("joint_offset", Site(3), (0.004,)),
+    Term("coulomb_friction", Site(2), (4.0,)),
+    Term("link_inertia", Site(3), (0.1,)),
+    Term("link_cog", Site(2), (0.4, -0.2, 0.1)),
+)
+
+
+def patched(path: Path, text: str) -> str:
+    path.write_text(text, encoding="utf-8")
+    model = Model(ARM).with_terms(CHANGES)
+    return format_of(path).patch(path, changes_of(model), PatchOptions(), []).text
+
+
+def elements(text: str) -> str:
+    """Return the canonical form of an arm, without comments and spaces between elements."""
+    return ElementTree.canonicalize(text, strip_text=True)
+
+
+def test_joints_and_links_in_comments_are_left_as_they_are(tmp_path: Path) -> None:
+    given = re.sub(r"\s*<!--.*?-->", "", urdf(ARM, UR_JOINTS))
+    older = "".join(f"<!-- {part} -->\n" for part in re.findall(
+        r"<joint name=[^>]*type.*?</joint>|<link name=[^>]*[^/]>.*?</link>", given, re.DOTALL
+    ))  # fmt: skip
+    assert older.count("<!--") == 2 * ARM.n + 1
+    begin = '<robot name="arm">'
+    given = given.replace("</joint>", "<!-- </joint> --></joint>")
+    commented = f"<!-- {begin} -->\n{given.replace(begin, begin + older)}"
+    text = patched(tmp_path / "commented.urdf", commented)
+    assert older in text
+    assert elements(text) == elements(patched(tmp_path / "plain.urdf", given))
+    assert elements(text) != elements(given)
