@@ -35,6 +35,7 @@ from gapbridge.core.notes import Note, Reason
 Table = tuple[list[str], Array, Index | None]
 ROWS = 16_384  # of a piece
 RECORDING = ".mcap"
+LOADS = ("actual_TCP_force", "payload", "payload_cog", "joint_temperatures")
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,8 @@ def reported_columns(recording: Path) -> dict[str, int]:
     """Return the columns of a recording that have any value, and how many rows of each lack one.
 
     What the controller never reported is no column. Decided for the recording as a whole: within
-    one chunk (0.4 s) a sensor may be silent. Holds one chunk at a time. Raises LogError.
+    one chunk (0.4 s) a sensor may be silent. Rows without a load are no rows of the log. Holds one
+    chunk at a time. Raises LogError.
     """
     from gapbridge.core.log.mcap_reading import read_batches
 
@@ -212,5 +214,10 @@ def _recording(path: Path, reported: Collection[str]) -> Iterator[Table]:
 
     for batch in read_batches(path):
         columns = {name: values for name, values in batch.columns.items() if name in reported}
+        # a lost sensor: what bends the arm is not known
+        known = [~np.isnan(columns[k].reshape(len(batch), -1)).any(axis=1)
+                 for k in LOADS if k in columns]  # fmt: skip
+        rows = np.logical_and.reduce(known) if known else np.full(len(batch), True)
+        columns = {name: values[rows] for name, values in columns.items()}
         if any(map(_has_values, columns.values())):
             yield *as_table(columns), None

@@ -160,6 +160,25 @@ def test_a_recording_read_in_pieces_tells_what_is_damaged(
     assert re.search(rf"note: {re.escape(str(path))}: .*is damaged: ", capsys.readouterr().err)
 
 
+def test_rows_without_the_force_of_a_lost_sensor_are_left_out_and_noted(tmp_path: Path) -> None:
+    desk = Desk(tmp_path / "recordings")
+    recorder, memory = desk.recorder(), desk.memory
+    for cycle in range(30):
+        row = memory.next_row()
+        row[1:] = 0.1
+        row[memory.slices["timestamp"]] = 0.002 * cycle
+        if 10 <= cycle < 14:
+            row[memory.slices["actual_TCP_force"]] = np.nan
+        memory.publish()
+    recorder.step(flush=True)
+    recorder.close()
+    found = Recording().read(desk.stem, (), SourceOptions())
+    assert np.isfinite(found.columns["actual_TCP_force"]).all()
+    kept = [cycle for cycle in range(30) if not 10 <= cycle < 14]
+    np.testing.assert_allclose(found.columns["timestamp"], 0.002 * np.array(kept))
+    assert found.notes == (Note(Reason.MISSING, (4, "actual_TCP_force")),)
+
+
 @pytest.mark.parametrize("segment_size", [256.0, 0.001])
 def test_a_column_without_a_value_for_a_whole_chunk_or_file_stays_and_is_noted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], segment_size: float
