@@ -169,6 +169,14 @@ def test_more_rows_than_the_sample_give_what_all_of_them_give(monkeypatch):
     assert found.remaining_rms_held_out == pytest.approx(whole.remaining_rms_held_out, rel=0.1)
 
 
+def test_a_log_in_which_nothing_was_measured_is_declined():
+    log = measured_log(False, False)
+    none = replace(log, columns=log.columns | {"measured_position": np.full((COUNT, 3), np.nan)})
+    for identify in (identify_streamed, identify_compliance):
+        with pytest.raises(ExcitationError):
+            identify(nominal(), [none] if identify is identify_streamed else none)
+
+
 @pytest.mark.parametrize("first", [0, 1])
 def test_the_sample_is_of_measured_rows_wherever_these_are(monkeypatch, first):
     monkeypatch.setattr(streamed, "SAMPLE_ROWS", 300)
