@@ -176,7 +176,8 @@ class Compensator:
             _rigid_pose(rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
             best, steps = self._solve_rows(nominal, loads, q)
             self._offset[:] = q - nominal if best < np.inf else 0.0
-            self._invert_servos(loads, q)
+            if best < np.inf:  # what is not solved is no setpoint, and may be no number
+                self._invert_servos(loads, q)
             _rigid_pose(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
             single.motion(self._wanted, self._pose, bool((q != nominal).any()), moved)
         return Correction(q, moved, best, steps)

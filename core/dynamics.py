@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.effects import CATALOGUE, Term, acting
+from gapbridge.core.effects import CATALOGUE, Term, acting, totals
 from gapbridge.core.kernels import rigid
 from gapbridge.core.kernels.reference import Chain
 from gapbridge.core.model import Model
@@ -219,7 +219,8 @@ def predict_tracking(model: Model, motion: Motion, terms: Sequence[Term] = ()) -
     q = motion.target_q
     if motion.held is None:
         motion = with_holding_torque(model, motion)
-    for term in acting((*model.terms, *terms), "tracking"):
+    # one lag of the sum: a lag made shorter is not undone by a negative one behind it
+    for term in acting(totals((*model.terms, *terms)), "tracking"):
         q = CATALOGUE[term.effect].track(term, model.arm, q, motion)
     return q
 

@@ -220,7 +220,9 @@ def _clock(log: Log, time: Array) -> tuple[Index, Array, LogFinding | None]:
     identical = np.ones(count, dtype=bool)
     for column in log.columns.values():
         flat = column.reshape(len(column), -1)
-        identical &= (flat[repeated] == flat[repeated - 1]).all(axis=1)
+        same = flat[repeated] == flat[repeated - 1]
+        empty = np.isnan(flat[repeated]) & np.isnan(flat[repeated - 1])
+        identical &= (same | empty).all(axis=1)
     if identical.mean() >= COPIES or count < FEW_REPEATS * len(time):
         kept = np.delete(all_rows, repeated)
         return kept, time[kept], LogFinding(LogCheck.COPIED_ROWS, (count, len(time), first))

@@ -12,7 +12,7 @@ from gapbridge.bridge.document.diagnosis_json import parameter_entries
 from gapbridge.bridge.document.provenance import fitted, intervals_of
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
-from gapbridge.core.effects import flexibility_names
+from gapbridge.core.effects import CATALOGUE, flexibility_names
 from gapbridge.core.estimation.identification import Identification
 
 
@@ -50,13 +50,30 @@ def cause_entries(diagnosis: Diagnosis, earlier: Sequence[Any] = ()) -> list[dic
 def intervals_applied(
     diagnosis: Diagnosis, *, stand_ins: bool = False
 ) -> dict[str, tuple[float, float]]:
-    """Return the 95 % interval of each number that ``--apply`` writes, by name."""
+    """Return the 95 % interval of each number that ``--apply`` writes, by name.
+
+    Of what adds up that is the total with what the cell held; 0 if it is gone.
+    """
+    model = diagnosis.with_stand_ins if stand_ins else diagnosis.model
+    written: dict[str, float] = {}
+    for term in model.terms:
+        for number in CATALOGUE[term.effect].reported(model.arm, term, None):
+            written[number.name] = written.get(number.name, 0.0) + number.value
     applied = [
         cause
         for channel in diagnosis.channels
         for cause in (*channel.causes, *(channel.stand_ins if stand_ins else ()))
     ]
-    return intervals_of((p.name, p.value, p.std) for cause in applied for p in cause.parameters)
+    numbers = (
+        (p.name, written.get(p.name, 0.0) if _adds_up(cause.effect) else p.value, p.std)
+        for cause in applied
+        for p in cause.parameters
+    )
+    return intervals_of(number for number in numbers if np.isfinite(number[1]))
+
+
+def _adds_up(effect: str) -> bool:
+    return CATALOGUE[effect].adds_up or bool(CATALOGUE[effect].flexibility)
 
 
 def provenance_of_fit(

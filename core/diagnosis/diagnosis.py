@@ -52,7 +52,7 @@ from gapbridge.core.diagnosis.judgement import (
 )
 from gapbridge.core.diagnosis.log_checks.missing_flexibility import flexibility_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
-from gapbridge.core.diagnosis.model_terms import model_terms, terms_with_stand_ins
+from gapbridge.core.diagnosis.model_terms import model_terms, terms_with_stand_ins, with_causes
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.selection.rounds import select
@@ -204,8 +204,8 @@ def _diagnose(
     return Diagnosis(
         _overall(channels), tuple(on_own_clocks(channel, log) for channel in channels),
         tuple(not_observable), next_measurements(model, log, channels), tuple(reported),
-        model.with_terms(model_terms(channels, log)),
-        model.with_terms(terms_with_stand_ins(channels, log)),
+        with_causes(model, model_terms(channels, log)),
+        with_causes(model, terms_with_stand_ins(channels, log)),
         log.session_names, log.one_clock,
     )  # fmt: skip
 

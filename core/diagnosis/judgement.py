@@ -49,7 +49,7 @@ from gapbridge.core.diagnosis.value_stability import (
     shifts_alike,
     stable_effects,
 )
-from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.effects import CATALOGUE, Parameter
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
@@ -241,7 +241,7 @@ def _insignificant(selection: Selection) -> dict[int, Withdrawal]:
         if c in straight:
             withdrawn[position] = Withdrawal(Check.CURVED)
         if candidate.curve is None and any(
-            min(abs(v - p.lower), abs(v - p.upper)) < 1e-6 * p.scale
+            _on_bound(p, v, candidate.effect.adds_up)
             for p, v in zip(candidate.parameters, term.values, strict=False)
         ):
             withdrawn[position] = Withdrawal(Check.INSIDE_BOUNDS)
@@ -253,6 +253,17 @@ def _insignificant(selection: Selection) -> dict[int, Withdrawal]:
         ):
             withdrawn[position] = Withdrawal(Check.USUAL_SIZE)
     return withdrawn
+
+
+def _on_bound(parameter: Parameter, value: float, adds_up: bool) -> bool:
+    """Return whether a value is on a bound that tells nothing of it.
+
+    Of what adds up, a lower bound below zero is what the model holds: it is gone.
+    """
+    below, above = abs(value - parameter.lower), abs(value - parameter.upper)
+    if adds_up and parameter.lower < 0:
+        below = np.inf
+    return min(below, above) < 1e-6 * parameter.scale
 
 
 def significant_alone(

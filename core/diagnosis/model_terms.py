@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
-from gapbridge.core.effects import CATALOGUE, Term
+from gapbridge.core.effects import CATALOGUE, Term, totals
 from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
 
 
 def model_terms(channels: Sequence[ChannelDiagnosis], log: Log) -> list[Term]:
@@ -37,6 +38,11 @@ def terms_with_stand_ins(channels: Sequence[ChannelDiagnosis], log: Log) -> list
         together = {(t.effect, t.site): t for t in channel.fitted_together}
         terms |= {key: term for key, term in together.items() if key in named}
     return _applied(list(terms.values()), log)
+
+
+def with_causes(model: Model, terms: Sequence[Term]) -> Model:
+    """Return the model with the terms added to its own: what is gone is in it no more."""
+    return replace(model, terms=totals((*model.terms, *terms)))
 
 
 def _applied(terms: list[Term], log: Log) -> list[Term]:

@@ -42,6 +42,8 @@ def structure_p_value(space: SampleSpace, nuisance: Array, chosen: Sequence[int]
         share = _squares_along(space.X, columns, sizes, residuals) / whole
         mean, deviation = float(share[1:].mean()), float(share[1:].std()) + 1e-300
         worst.append((share - mean) / deviation)
+    if not worst:  # what is fitted leaves no direction to any column
+        return 1.0
     top = np.max(np.array(worst), axis=0)  # the most significant family, of data and of each draw
     return float((1 + np.sum(top[1:] >= top[0])) / (1 + DRAWS))
 

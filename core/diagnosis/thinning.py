@@ -1,8 +1,4 @@
-"""Fewer samples of a channel, for the search: one of each even stretch of every session.
-
-Samples at even distances would all be of one phase of what alternates from row to row, as two
-loads do that are measured in turn; each is drawn at random from its stretch.
-"""
+"""Fewer samples of a channel, for the search: one of each even stretch of every session."""
 
 from __future__ import annotations
 
@@ -13,9 +9,8 @@ import numpy as np
 
 from gapbridge.core.arrays import Index
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
+from gapbridge.core.estimation.sampling import SEED, one_of_each_stretch
 from gapbridge.core.log.log import Log
-
-SEED = 0
 
 
 def drawn(session: Index, most: int) -> Index:
@@ -30,8 +25,7 @@ def drawn(session: Index, most: int) -> Index:
     taken, left = [], most
     for i, own in enumerate(sorted(rows, key=len)):
         count = min(len(own), left // (len(rows) - i))
-        ends = np.linspace(0, len(own), count + 1).astype(np.int64)
-        taken.append(own[rng.integers(ends[:-1], ends[1:])])
+        taken.append(own[one_of_each_stretch(len(own), count, rng)])
         left -= count
     return np.sort(np.concatenate(taken))
 

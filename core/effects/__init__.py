@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 
 from gapbridge.core.effects.effect import (
     CHANNELS,
@@ -129,6 +130,33 @@ def settling(terms: Iterable[Term]) -> list[Term]:
     return [t for t in acting(terms, "tracking") if type(CATALOGUE[t.effect]).settle is not own]
 
 
+def totals(terms: Iterable[Term]) -> tuple[Term, ...]:
+    """Return the terms with those that add up as one of each site; totals of zero are left out.
+
+    A stand-in is summed with what is proved, and then proved no more. A stiffness curve with a
+    negative slope takes over the flexibility that it softens: only together are they 0 or more.
+    """
+    summed: dict[object, Term] = {}
+    for number, term in enumerate(terms):
+        effect = CATALOGUE[term.effect]
+        key: object = (term.effect, term.site) if effect.adds_up else number
+        if key in summed:
+            before = summed[key]
+            values = tuple(a + b for a, b in zip(before.values, term.values, strict=True))
+            term = replace(term, values=values, stand_in=before.stand_in or term.stand_in)
+        summed[key] = term
+    for key, term in list(summed.items()):
+        effect = CATALOGUE[term.effect]
+        if effect.has_nonlinearity and term.values[0] < 0:
+            straight = [
+                k for k, other in summed.items()
+                if other.effect == effect.replaces and other.site.joint == term.site.joint
+            ]  # fmt: skip
+            slope = term.values[0] + sum(summed.pop(k).values[0] for k in straight)
+            summed[key] = replace(term, values=(max(slope, 0.0), *term.values[1:]))
+    return tuple(t for t in summed.values() if not CATALOGUE[t.effect].adds_up or any(t.values))
+
+
 def by_approach(terms: Iterable[Term]) -> bool:
     """Return whether terms ask for the joints' last motions."""
     return any(CATALOGUE[term.effect].depends_on_approach for term in terms)
@@ -194,4 +222,5 @@ __all__ = [
     "settling",
     "split_name",
     "ties_of",
+    "totals",
 ]

@@ -126,6 +126,8 @@ class Effect(ABC):
     adds_torque: ClassVar[bool] = False  # True: to that of the other terms, whatever it is
     depends_on_load: ClassVar[bool] = False  # True: ``added`` depends on the load of the joint
     adds_mass: ClassVar[bool] = False  # True: kg in addition to the declared payload
+    # True: 0 or more, and two terms of one site are the same as one with the sum of their values
+    adds_up: ClassVar[bool] = False
     scales_reading: ClassVar[bool] = False  # True: does not change a reading of zero
     fits_any_constant: ClassVar[bool] = False  # True: can represent any constant reading
     estimated_as_whole: ClassVar[bool] = False  # True: small at all sites of a real arm

@@ -263,6 +263,8 @@ def _distinct(data: Data, enough: int) -> int:
     Some rows of a long log are counted first, and the others only if fewer than ``enough`` differ.
     """
     loads = (data.loads.payload_mass, data.loads.payload_cog, data.loads.wrench)
+    if not len(data.q):
+        return 0
     columns = [values.reshape(len(data.q), -1) for values in loads if values is not None]
     table = np.column_stack([data.q, *columns])
     count = len(np.unique(table[:: max(len(table) // (4 * enough), 1)], axis=0))

@@ -22,6 +22,7 @@ from gapbridge.core.estimation.compliance_fit import (
 from gapbridge.core.estimation.held_out import jackknife, leave_one_out, pose_groups, random_folds
 from gapbridge.core.estimation.least_squares import inverse
 from gapbridge.core.estimation.robust import robust_weights, whitening_factors
+from gapbridge.core.estimation.sampling import one_of_each_stretch
 
 POSE_PARTS = 50  # groups of poses, left out in turn: determines a std to 10 %
 MAX_ROWS = 2000  # used for the jackknife
@@ -35,7 +36,7 @@ def with_pose_scatter(fit: Fit, data: Data, shown: Identifiable, sigma: float) -
     Cameron, Miller, "A Practitioner's Guide to Cluster-Robust Inference" (2015), CV3.
     """
     kept, count = shown.kept, int(shown.kept.sum())
-    sample = data.part(slice(None, None, -(-len(data.q) // MAX_ROWS)))
+    sample = data.part(one_of_each_stretch(len(data.q), MAX_ROWS))
     A, b, prior = _rows(fit, sample, shown, sigma)
     width = len(b) // len(sample.q)
     parts = random_folds(pose_groups(sample.q), POSE_PARTS)

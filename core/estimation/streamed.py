@@ -46,6 +46,7 @@ from gapbridge.core.estimation.identification import (
 )
 from gapbridge.core.estimation.pose_scatter import with_pose_scatter
 from gapbridge.core.estimation.robust import weights_at
+from gapbridge.core.estimation.sampling import one_of_each_stretch
 from gapbridge.core.estimation.streamed_fit import (
     NO_WEIGHTS,
     Accumulated,
@@ -248,7 +249,7 @@ class _GeometryFit:
 
 def _fit_with_geometry(before: Fit, sample: Data, fitting: _Fitting) -> _GeometryFit | None:
     """Return the fit of some rows with geometry, which is then fixed; None: likelier without."""
-    sample_rows = sample.part(slice(None, None, max(len(sample.q) // LINK_ROWS, 1)))
+    sample_rows = sample.part(one_of_each_stretch(len(sample.q), LINK_ROWS))
     fit = with_free_geometry(fitting.fit_sample(before, sample_rows), sample_rows)
     if fit.geometry is None:
         return None
@@ -270,13 +271,15 @@ def _stream(log: Iterable[Log], metrology: Metrology, model: Model) -> Stream:
         else:
             empty = data
         first += len(part)
-    stride = max(store.count // SAMPLE_ROWS, 1)
+    taken, begin = one_of_each_stretch(store.count, SAMPLE_ROWS), 0
     kept, folds = [], []
     for number, (data, rows) in enumerate(store):
         fold = np.empty(len(rows), dtype=np.int64)
         for k, rows_of_fold in fold_slices(number, len(rows)):
             fold[rows_of_fold] = k
-        sampled = rows % stride == 0
+        end = begin + len(rows)
+        sampled = taken[(taken >= begin) & (taken < end)] - begin
+        begin = end
         kept.append(data.part(sampled))
         folds.append(fold[sampled])
     if not kept:  # no row at all: reported by require_excitation

@@ -215,6 +215,17 @@ def test_what_cannot_be_solved_says_so_and_spoils_no_later_setpoint(what, terms)
     assert after.residual < 1e-8
 
 
+@pytest.mark.parametrize("what", BAD)
+def test_what_cannot_be_solved_is_the_nominal_setpoint_also_where_servos_droop(what):
+    live = Compensator(SIX.with_terms([Term("servo_droop", Site(2), (1e-4,))]))
+    live.correct(np.array([0.3, -1.2, 1.4, -0.5, 0.8, 0.2]))  # leaves its torques behind
+    q, loads = BAD[what]
+    found = live.correct(q, loads)
+    assert found.residual == np.inf
+    np.testing.assert_array_equal(found.q, q)
+    np.testing.assert_array_equal(found.offset_in_base, 0.0 * q)
+
+
 def model_of(n, rng, softness=5e-6):
     tool = np.eye(4)
     tool[:3, :3], tool[:3, 3] = rotation_matrix(rng.normal(size=3)), rng.uniform(-0.2, 0.2, 3)

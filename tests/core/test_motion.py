@@ -141,6 +141,17 @@ def test_cycles_recorded_twice_count_once_and_are_reported():
     assert time_finding(log) is None
 
 
+def test_cycles_recorded_twice_are_recognised_where_cells_are_empty():
+    _, log = recording()
+    measured = np.full((len(log), 3), np.nan)
+    measured[::10] = 0.1
+    twice = replace(log, columns=dict(log.columns) | {"measured_position": measured}).select(
+        np.repeat(np.arange(len(log)), 2)
+    )
+    assert len(motion_of(twice)) == len(log)
+    assert time_finding(twice) == LogFinding(LogCheck.COPIED_ROWS, (len(log), 2 * len(log), 2))
+
+
 def test_rounded_timestamps_are_replaced_by_an_even_clock():
     t, log = recording(25.0, 40)
     rounded = truth.log_of(6, timestamp=np.round(t, 1), actual_q=log.columns["actual_q"])

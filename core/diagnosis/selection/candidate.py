@@ -42,6 +42,7 @@ class Candidate:
     quantity: str = ""  # the quantity that a smooth candidate is a function of
     target: str = ""  # the joint, axis or frame that it moves
     requires: str = ""  # family without which it changes no prediction
+    whole: tuple[Parameter, ...] = ()  # with those fixed in its columns, bounded; (): as nominal
 
     @property
     def named(self) -> bool:

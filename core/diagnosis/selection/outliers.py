@@ -13,6 +13,7 @@ from gapbridge.core.diagnosis.criteria import (
     MAX_EXCLUDED_SHARE,
     MAX_OUTLIER_SHARE,
     MAX_UNPREDICTED_SHARE,
+    MIN_FREEDOM_OF_SESSION,
 )
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
@@ -90,13 +91,16 @@ def _keep(observation: Observation, noise: Noise, residual: Array) -> NDArray[np
     """Return the inliers (N,): without the farthest outliers, of which a share is the limit.
 
     In recordings few are excluded: there they are friction at rest or delay, not bad readings.
+    Those kept determine the frame, and leave something to explain.
     """
     white = whitened(noise, residual)
     distance = distance_of(white, scale_of(white))
     outliers = np.flatnonzero(distance >= OUTLIER)
     moving = observation.channel in ("torque", "tracking")
     share = MAX_OUTLIER_SHARE if moving else MAX_EXCLUDED_SHARE
-    limit = int(np.ceil(share * len(residual)))
+    N, k, p = observation.nuisance.shape
+    spare = max(N - -(-(p + MIN_FREEDOM_OF_SESSION) // k), 0)
+    limit = min(int(np.ceil(share * N)), spare)
     kept = np.ones(len(residual), dtype=bool)
     kept[outliers[np.argsort(-distance[outliers])][:limit]] = False
     return kept

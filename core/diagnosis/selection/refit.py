@@ -436,7 +436,7 @@ def with_free_shape(arm: Arm, candidate: Candidate) -> Candidate:
     """Return the candidate with all parameters free, also those fixed in its columns."""
     if not (candidate.effect.has_nonlinearity or candidate.effect.start_values):
         return candidate
-    parameters = candidate.effect.parameters(arm, candidate.site)
+    parameters = candidate.whole or candidate.effect.parameters(arm, candidate.site)
     return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)
 
 

@@ -15,11 +15,11 @@ from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
     CONTAINED_SHARE,
     LARGE_SAMPLE,
-    MAX_PAYLOAD_FACTOR,
     NEGLIGIBLE_WORTH,
     UNDETERMINED_SPREAD,
 )
 from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.bounds import bounded
 from gapbridge.core.diagnosis.selection.candidate import (
     Candidate,
     joint_quantity,
@@ -51,7 +51,6 @@ from gapbridge.core.diagnosis.selection.step_times import step_candidates
 from gapbridge.core.diagnosis.selection.stiffness_curves import with_straight_stiffness
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
-from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.model import Model
 
 ROUNDS = 8
@@ -239,7 +238,7 @@ def _named_candidates(
     ]
     rotation = observation.measured.shape[1] > 3
     return [
-        with_requirement(observation, _bounded(c, model, observation))
+        with_requirement(observation, bounded(c, model, observation))
         for c in named_candidates(model.arm, observation.channel, withheld, rotation, base, turns)
         if _observable(c, observation)
     ]
@@ -295,35 +294,6 @@ def _without_smooth_part(
     both = np.concatenate([*columns, state.observation.nuisance], axis=2)
     rows, target = flat(both, state), flat(residual[..., None], state)[:, 0]
     return np.asarray(residual - both @ solve(rows, target))
-
-
-def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Candidate:
-    """Return the candidate with bounds that keep the model physical (flexibility >= 0).
-
-    Of a stiffness curve the bound holds for the sum of its two parts.
-    """
-    if candidate.effect.adds_mass:
-        least, most = _payload_bounds(model, observation)
-        mass = replace(candidate.parameters[0], lower=least, upper=most)
-        return replace(candidate, parameters=(mass, *candidate.parameters[1:]))
-    kind, curved = candidate.effect.flexibility, candidate.curve is not None
-    if not (kind or curved):
-        return candidate
-    axial, radial = model.compliance()
-    compliance = radial if kind == "radial" else axial
-    assert candidate.site.joint is not None
-    lower = -float(compliance[candidate.site.joint - 1])
-    bounded = replace(candidate.parameters[0], lower=lower)
-    return replace(candidate, parameters=(bounded, *candidate.parameters[1:]))
-
-
-def _payload_bounds(model: Model, observation: Observation) -> tuple[float, float]:
-    """Return bounds of a payload's error: every true mass is from 0 to the largest plausible."""
-    declared = observation.payload_mass
-    if declared is None:
-        declared = np.array([model.payload_mass])
-    least, most = float(declared.min()), float(declared.max())
-    return -least, MAX_PAYLOAD_FACTOR * max(most, LoadBounds.of(model).rated) - most
 
 
 def _observable(candidate: Candidate, observation: Observation) -> bool:

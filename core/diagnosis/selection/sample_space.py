@@ -154,7 +154,10 @@ def _eliminated(products: Array, least: float) -> Array:
 
 
 def fit(space: SampleSpace, chosen: Sequence[int]) -> CandidateFit:
-    """Return the joint fit of a set; its score is infinite if a value is not plausible."""
+    """Return the joint fit of a set; its score is infinite where it is no explanation.
+
+    That is where a value is not plausible, or as many are free as there are numbers to explain.
+    """
     if not chosen:
         rss = float(space.y @ space.y)
         return CandidateFit((), float(space.misfit(np.array(rss))), rss)
@@ -171,6 +174,8 @@ def fit(space: SampleSpace, chosen: Sequence[int]) -> CandidateFit:
     ends = np.cumsum([0, *(len(space.candidates[c].parameters) for c in chosen)]).tolist()
     slices = [slice(begin, end) for begin, end in pairwise(ends)]
     parts, spread = [values[o] for o in slices], [deviation[o] for o in slices]
+    if len(V) >= space.freedom:  # explains anything
+        score = np.inf
     families = {"", *(space.candidates[c].family for c in chosen)}
     for c, x, s in zip(chosen, parts, spread, strict=True):
         if space.candidates[c].requires not in families:

@@ -25,6 +25,7 @@ class Backlash(JointEffect):
     identifier = "backlash"
     title = "play in the joint"
     label_template = "play of joint {joint}"
+    adds_up = True
     depends_on_approach = True
     channels = ("position",)
     simulated_as = Kind.PLAY

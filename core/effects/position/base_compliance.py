@@ -24,6 +24,7 @@ class BaseCompliance(Effect):
     identifier = "base_compliance"
     title = "foundation gives way"
     label_template = "yielding of the foundation about {part}"
+    adds_up = True
     softens = True
     channels = ("position",)
     motion = "poses and payloads that change the moment on the base, in all directions around it"

@@ -23,6 +23,7 @@ class LinkFlexibility(Effect):
     identifier = "link_flexibility"
     title = "link bends under load"
     label_template = "bending of link {joint}"
+    adds_up = True
     softens = True
     channels = ("position",)
     motion = "payloads or pulls in several directions, so that force and moment on the link differ"

@@ -33,6 +33,7 @@ class StiffnessNonlinearity(JointEffect):
     identifier = "stiffness_nonlinearity"
     title = "joint stiffens under load"
     label_template = "stiffening of joint {joint} ({part})"
+    adds_up = True
     softens = True
     has_nonlinearity = True
     replaces = "axial_compliance"

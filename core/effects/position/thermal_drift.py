@@ -24,6 +24,7 @@ class ThermalDrift(Effect):
     identifier = "thermal_drift"
     title = "links grow as they warm up"
     label_template = "growth of link {joint} with warmth"
+    adds_up = True
     channels = ("position",)
     needs = ("joint_temperatures",)
     motion = "joint temperatures that change by several degrees"

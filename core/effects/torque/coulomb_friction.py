@@ -27,6 +27,7 @@ class CoulombFriction(TorqueEffect):
     identifier = "coulomb_friction"
     title = "constant friction"
     order = 52
+    adds_up = True
     simulated_as = Kind.FRICTION
     estimated_with_links = True
     motion = "the joint moved both ways"

@@ -27,6 +27,7 @@ class LoadFriction(TorqueEffect):
     title = "friction grows with load"
     label_template = "load friction of joint {joint}"
     order = 53
+    adds_up = True
     depends_on_load = True
     motion = "the joint moved both ways under loads that change"
     equivalents: ClassVar = {"coulomb_friction": "motion under one load"}

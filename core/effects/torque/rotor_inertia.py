@@ -26,6 +26,7 @@ class RotorInertia(TorqueEffect):
     identifier = "rotor_inertia"
     title = "motor inertia is missing"
     order = 30
+    adds_up = True
     simulated_as = Kind.ARMATURE
     motion = "accelerations of the joint, at several poses of those beyond"
     simulator_advice = "set the joint's armature where the simulator has it"

@@ -25,6 +25,7 @@ class ViscousFriction(TorqueEffect):
     identifier = "viscous_friction"
     title = "friction grows with speed"
     order = 51
+    adds_up = True
     simulated_as = Kind.DAMPING
     estimated_with_links = True
     motion = "the joint moved at several speeds"

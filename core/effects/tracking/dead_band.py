@@ -27,6 +27,7 @@ class DeadBand(ServoEffect):
     title = "servo stops before its target"
     label_template = "dead band of servo {joint}"
     order = 70
+    adds_up = True
     depends_on_approach = True
     motion = "the joint moved both ways, or poses reached from both sides"
     equivalents: ClassVar = {

@@ -27,6 +27,7 @@ class Latency(ServoEffect):
     identifier = "latency"
     title = "joint reacts late"
     order = 20
+    adds_up = True
     is_delay = True
     simulated_as = Kind.DELAY
     needs = ("timestamp",)

@@ -28,6 +28,7 @@ class ServoDroop(JointEffect):
     title = "servo gives way under load"
     label_template = "droop of servo {joint} per torque"
     order = 60
+    adds_up = True
     channels = ("tracking",)
     simulated_as = Kind.SERVO_COMPLIANCE
     motion = "poses, payloads or pulls that change the torque that the joint holds"

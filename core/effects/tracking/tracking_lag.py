@@ -25,6 +25,7 @@ class TrackingLag(ServoEffect):
     identifier = "tracking_lag"
     title = "joint lags behind"
     order = 30
+    adds_up = True
     is_delay = True
     simulated_as = Kind.LAG
     needs = ("timestamp",)

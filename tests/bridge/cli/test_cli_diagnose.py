@@ -368,3 +368,24 @@ def test_five_poses_for_forty_parameters_end_without_a_traceback(tmp_path: Path)
     same = {k: np.repeat(v[:1], 30) for k, v in table.items()}
     line = refused("diagnose", log_in(tmp_path, same), "--cell", cell)
     assert "position: at least 4 different poses (found 1 in 30 rows)" in line
+
+
+@pytest.mark.parametrize("left", [3e-4, 0.0])
+def test_apply_writes_the_total_of_what_has_become_less(tmp_path: Path, left: float) -> None:
+    q, loads = poses_and_loads(60)
+    sides = np.random.default_rng(2).choice([-1.0, 1.0], q.shape)
+    play = Term("backlash", Site(2), (left,))
+    now = Model(builtin_arm("ur10e"), terms=(play,))
+    columns = columns_of(q, loads) | {f"approach_{i}": sides[:, i] for i in range(6)}
+    log = log_in(tmp_path, columns | measured(now, q, replace(loads, approach=sides), noise=2e-5))
+    held = "effects:\n  - {effect: backlash, joint: 2, parameters: {value: 2.0e-3}}\n"
+    new = tmp_path / "new.yaml"
+    answer = gapbridge("diagnose", log, "--cell", cell_in(tmp_path, CELL + held), "--apply", new)
+    assert answer.code == 0, answer.err
+    assert "verdict: explained" in answer.out
+    cell = load_cell(new)
+    total = sum(t.values[0] for t in cell.model.terms)
+    assert total == pytest.approx(left, abs=3e-5)
+    low, high = cell.intervals["backlash_2"]
+    assert (low + high) / 2 == pytest.approx(total, abs=1e-9)
+    assert len(cell.model.terms) == (total != 0.0)

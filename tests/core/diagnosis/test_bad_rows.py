@@ -9,9 +9,12 @@ import pytest
 import small_arm as small
 from further import further
 
+from gapbridge.core.arm import builtin_arm
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 SOFT = replace(
     small.NOMINAL, axial=np.array(small.KIND.axial), radial=np.array(small.KIND.radial)
@@ -46,3 +49,19 @@ def test_fit_and_diagnose_agree_on_bad_rows(seed, poses, bad, registered):
         (found,) = (p for c in channel.causes for p in c.parameters
                     if p.name == f"{term.effect}_{term.site.joint}")  # fmt: skip
         assert abs(found.value - value) < 3 * np.hypot(found.std, std)
+
+
+@pytest.mark.parametrize(("poses", "bad", "seed"), [(4, 1, 2), (4, 2, 0), (4, 2, 2), (5, 2, 1)])
+@pytest.mark.filterwarnings("error")
+def test_bad_rows_among_the_fewest_poses_end_no_diagnosis_and_accuse_nothing(poses, bad, seed):
+    rng, model = np.random.default_rng(seed), Model(builtin_arm("ur10e"))
+    q = rng.uniform(-2, 2, (poses, 6))
+    measured = model.predict(q).position + rng.normal(size=(poses, 3)) * 3e-5
+    measured[rng.permutation(poses)[:bad]] += rng.normal(size=(bad, 3)) * 0.05
+    log = Log("log", {"actual_q": q, "measured_position": measured}, 6)
+    (channel,) = diagnose(model, log, Metrology(registered=False)).channels
+    assert not channel.causes
+    observation = channel.selection.observation
+    N, k, p = observation.nuisance.shape
+    rows = len(channel.outliers)
+    assert k * (N - rows) >= p + 3

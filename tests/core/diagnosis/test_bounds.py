@@ -10,9 +10,9 @@ import small_arm as small
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.diagnosis.channels import position, torque, wrench
+from gapbridge.core.diagnosis.selection.bounds import payload_bounds
 from gapbridge.core.diagnosis.selection.candidate import named_candidates
 from gapbridge.core.diagnosis.selection.refit import _step
-from gapbridge.core.diagnosis.selection.rounds import _payload_bounds
 from gapbridge.core.metrology import Metrology
 
 ARM = builtin_arm("ur5")
@@ -61,4 +61,4 @@ def test_the_true_payload_is_from_nothing_to_three_times_the_rated(channel, decl
     )  # fmt: skip
     model = replace(small.model_of(), payload_mass=cell)  # rated for 10 kg
     seen = channel.observe(model, log, Metrology(registered=True))
-    assert _payload_bounds(model, seen) == pytest.approx(bounds)
+    assert payload_bounds(model, seen) == pytest.approx(bounds)

@@ -120,3 +120,10 @@ def test_squares_along_few_and_many_columns_are_those_of_their_products(columns)
     found = residual_structure._squares_along(X, used, sizes, residuals)
     expected = np.sum((residuals @ (X[:, used] / sizes)) ** 2, axis=1)
     assert found == pytest.approx(expected, rel=1e-12)
+
+
+def test_without_a_direction_left_there_is_no_structure():
+    whole = np.linalg.qr(np.random.default_rng(7).normal(size=(ROWS, ROWS - 1)))[0]
+    bare = space(0)
+    inside = replace(bare, X=whole @ (whole.T @ bare.X))
+    assert structure_p_value(inside, whole, ()) == 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +13,7 @@ from pyarrow import parquet
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import ExcitationError, LogError
-from gapbridge.core.estimation import streamed
+from gapbridge.core.estimation import pose_scatter, streamed
 from gapbridge.core.estimation.identification import data_of, identify_compliance
 from gapbridge.core.estimation.streamed import RowStore, identify_streamed
 from gapbridge.core.estimation.streamed_fit import fold_slices
@@ -166,6 +167,54 @@ def test_more_rows_than_the_sample_give_what_all_of_them_give(monkeypatch):
     np.testing.assert_array_equal(found.outliers, whole.outliers)
     assert found.remaining_rms == pytest.approx(whole.remaining_rms, rel=1e-3)
     assert found.remaining_rms_held_out == pytest.approx(whole.remaining_rms_held_out, rel=0.1)
+
+
+def test_a_log_in_which_nothing_was_measured_is_declined():
+    log = measured_log(False, False)
+    none = replace(log, columns=log.columns | {"measured_position": np.full((COUNT, 3), np.nan)})
+    for identify in (identify_streamed, identify_compliance):
+        with pytest.raises(ExcitationError):
+            identify(nominal(), [none] if identify is identify_streamed else none)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_the_sample_is_of_measured_rows_wherever_these_are(monkeypatch, first):
+    monkeypatch.setattr(streamed, "SAMPLE_ROWS", 300)
+    log = measured_log(False, False)
+    position = np.full((COUNT, 3), np.nan)
+    position[first::2] = log.columns["measured_position"][first::2]
+    odd = replace(log, columns=log.columns | {"measured_position": position})
+    stream = streamed._stream(pieces_of(odd), Metrology(registered=True), nominal())
+    assert len(stream.sample.q) == len(stream.fold) == 300
+    assert np.isfinite(stream.sample.position).all()
+    assert len(np.unique(stream.sample.q[:, 0])) == 300
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_two_loads_measured_in_turn_are_both_in_every_sample(monkeypatch, first):
+    """At even distances all rows of a sample would be of one load."""
+    monkeypatch.setattr(streamed, "SAMPLE_ROWS", 300)
+    monkeypatch.setattr(streamed, "LINK_ROWS", 100)
+    monkeypatch.setattr(pose_scatter, "MAX_ROWS", 100)
+    log = measured_log(False, False)
+    mass = np.where(np.arange(COUNT) % 2 == first, 0.0, 8.0)
+    turns = replace(log, columns=log.columns | {"payload": mass})
+    stream = streamed._stream(pieces_of(turns), Metrology(registered=True), nominal())
+    seen = []
+    monkeypatch.setattr(pose_scatter, "_rows", lambda fit, data, *_: seen.append(data) or 1 / 0)
+    monkeypatch.setattr(streamed, "with_free_geometry", lambda fit, data: seen.append(data) or fit)
+    shown = SimpleNamespace(kept=np.ones(12, dtype=bool))
+    sample = replace(stream.sample, loads=replace(stream.sample.loads, payload_mass=np.resize(
+        [0.0, 8.0], 300)))  # fmt: skip
+    streamed._fit_with_geometry(
+        SimpleNamespace(geometry=None), sample,
+        SimpleNamespace(fit_sample=lambda before, rows: before),
+    )  # fmt: skip
+    with pytest.raises(ZeroDivisionError):
+        pose_scatter.with_pose_scatter(None, sample, shown, 1.0)
+    assert [len(data.q) for data in seen] == [100, 100]
+    for data in (stream.sample, *seen):
+        assert 0.3 < np.mean(data.loads.payload_mass > 0) < 0.7
 
 
 def test_rows_that_wait_in_a_file_are_those_that_came():
