@@ -97,6 +97,10 @@ class ProjectedSystem:
     matrix: Array  # (2n+1, 2n) per rad/Nm
     right: Array  # (2n+1,)
 
+    def over(self, noise: float) -> ProjectedSystem:
+        """Return the system of a noise that is larger by this factor."""
+        return ProjectedSystem(self.matrix / noise, self.right / noise)
+
 
 @dataclass(frozen=True)
 class Fit:

@@ -106,12 +106,23 @@ class _FitSettings:
         all_free = np.ones(len(centre), dtype=bool)
         first = fit_flexibilities(before, data, all_free, self.prior, self.rounds, self.converged)
         assert first.linear is not None
-        kept = base_parameters.choose_identifiable(first.linear, self.prior)
+        noise = self._noise(first, data, all_free)
+        kept = base_parameters.choose_identifiable(first.linear, self.prior, noise)
         values, n = np.where(kept, first.flexibility, centre), len(centre) // 2
         begin = replace(first, model=first.model.with_compliance(values[:n], values[n:]))
         fit = fit_flexibilities(begin, data, kept, self.prior, converged=self.converged)
         assert fit.linear is not None
-        return fit, base_parameters.identifiability_of(fit.linear, kept, self.prior[1])
+        noise = self._noise(fit, data, kept)
+        return fit, base_parameters.identifiability_of(fit.linear, kept, self.prior[1], noise)
+
+    def _noise(self, fit: Fit, data: Data, kept: Mask) -> float:
+        """Return the noise of a fit's residual over the robust one."""
+        assert fit.linear is not None
+        width = 3 if data.rotation is None else 6
+        spare = width * float(fit.weights.sum()) - data.nuisances
+        return base_parameters.residual_noise(
+            fit.linear, fit.flexibility, kept, self.prior[1], spare
+        )
 
 
 def identify_compliance(

@@ -37,6 +37,7 @@ def with_pose_scatter(fit: Fit, data: Data, shown: Identifiable, sigma: float) -
     kept, count = shown.kept, int(shown.kept.sum())
     sample = data.part(slice(None, None, -(-len(data.q) // MAX_ROWS)))
     A, b, prior = _rows(fit, sample, shown, sigma)
+    A, b = A / shown.noise, b / shown.noise
     width = len(b) // len(sample.q)
     parts = random_folds(pose_groups(sample.q), POSE_PARTS)
     if not count or (int(parts.max()) + 1) * width < MIN_PARTS_FACTOR * A.shape[1]:
