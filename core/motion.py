@@ -243,6 +243,24 @@ def is_moving(time: Array, q: Array, speed: Array | None = None) -> bool:
     return not (at_rest and float(np.median(jump)) > 0.01)
 
 
+def time_stretches(log: Log, count: int) -> Index | None:
+    """Return the number (N,) of each row's stretch of time, ``count`` even ones of a recording.
+
+    Pauses are left out. Neighbours in time share their errors, as repeats of a pose do. None for
+    poses at rest, and where rows are not in time order.
+    """
+    time, q = log.get("timestamp"), log.get("actual_q")
+    q = log.get("target_q") if q is None else q
+    if time is None or q is None or not (np.diff(time) >= 0).all():
+        return None
+    if not is_moving(time, q, log.get("actual_qd")):
+        return None
+    step = np.diff(time)
+    recorded = np.append(0.0, np.cumsum(np.where(step > GAP * np.median(step), 0.0, step)))
+    number = recorded / max(float(recorded[-1]), 1e-9) * count
+    return np.asarray(np.minimum(number.astype(np.int64), count - 1))
+
+
 def time_finding(log: Log) -> LogFinding | None:
     """Return the finding on repeated timestamps of a moving log; or None."""
     time, q = log.get("timestamp"), log.get("actual_q")
