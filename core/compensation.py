@@ -38,6 +38,7 @@ from gapbridge.core.model import Model, Poses
 
 NO_LOADS = Loads()
 ROW_INDEX = np.int64  # type of a row number: a literal would be compiled as another signature
+DEPENDENT = 1e-8  # share of a Jacobian's column beside the others below which it is rounding
 SERVO_ROUNDS = 2  # fixed-point iterations of the inverse servo model
 
 
@@ -83,21 +84,61 @@ def newton_offset(chain_block, row_block, shape_block, pose, offset):  # type: i
     null-space motion does not accumulate from setpoint to setpoint.
     """
     n = offset.shape[0]
+    error, J = np.empty(6), np.empty((6, n))
+    distance = _linearised(chain_block, row_block, shape_block, pose, error, J)
+    if distance < 0:
+        return -1.0
+    for k in range(6):
+        for i in range(n):
+            error[k] += J[k, i] * offset[i]
+    smallest_offset(J, error, offset)
+    return distance
+
+
+@njit(**JIT)
+def _linearised(chain_block, row_block, shape_block, pose, error, J):  # type: ignore[no-untyped-def]
+    """Write the pose error (6,) at the row's q and the Jacobian (6, n), rotations times the lever.
+
+    Returns the distance (m) from the wanted pose (12,), -1 as ``newton_offset``.
+    """
+    n = J.shape[1]
     shape = shape_of(shape_block, n)
     if kernel.equilibrium(chain_of(chain_block, n), row_of(row_block, n), ROW_INDEX(0), shape) < 0:
         return -1.0
-    error, J = np.empty(6), np.empty((6, n))
     distance = _pose_error(shape, pose, error)
     if not np.isfinite(distance):
         return -1.0
     kernel.jacobian(shape, J)
-    for k in range(6):
+    for k in range(3, 6):
         for i in range(n):
-            if k > 2:
-                J[k, i] *= LEVER
-            error[k] += J[k, i] * offset[i]
-    smallest_offset(J, error, offset)
+            J[k, i] *= LEVER
     return distance
+
+
+@njit(**JIT)
+def _reachable(chain_block, row_block, shape_block, pose, J):  # type: ignore[no-untyped-def]
+    """Return the part (m) of the distance from a wanted pose (12,) that lies within J's range.
+
+    J (6, n) is overwritten by an orthonormal basis of it (Gram and Schmidt); inf where there is no
+    equilibrium.
+    """
+    error, square = np.empty(6), 0.0
+    if _linearised(chain_block, row_block, shape_block, pose, error, J) < 0:
+        return np.inf
+    for i in range(J.shape[1]):
+        column = J[:, i]
+        length = np.sqrt(np.sum(column * column))
+        for _ in range(2):  # the second time for rounding
+            for j in range(i):
+                column -= np.sum(J[:, j] * column) * J[:, j]
+        left = np.sqrt(np.sum(column * column))
+        if left > DEPENDENT * length:
+            column /= left
+            part = np.sum(column * error)
+            square += part * part
+        else:
+            column[:] = 0.0
+    return np.sqrt(square)
 
 
 @njit(**JIT)
@@ -181,6 +222,22 @@ class Compensator:
             _rigid_pose(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
             single.motion(self._wanted, self._pose, bool((q != nominal).any()), moved)
         return Correction(q, moved, best, steps)
+
+    def missed(self, nominal_q: Array, loads: Loads, residual: float) -> float:
+        """Return the part (m) of the last correction's residual that the joints could correct.
+
+        With fewer than six joints the rest is out of their reach; from six on it is all of it.
+        """
+        n = self._n
+        if n >= 6 or not residual < np.inf:
+            return residual
+        row, trial = self._view, nominal_q + self._offset
+        self._write_loads(loads)
+        row.q[0], row.link_scale[0] = trial, 1.0
+        self.model.condition(row, loads, trial[None], self._conditions)
+        # a shape of its own: the one of the compiled call is laid out in another way
+        J, shape = np.empty((6, n)), np.zeros(len(self._shape))
+        return float(_reachable(self._chain, self._row, shape, self._wanted, J))
 
     def correct_rows(self, nominal_q: Array, loads: Loads) -> Correction:
         """Return the corrected setpoints for ``nominal_q`` (N, n), as ``correct`` does."""

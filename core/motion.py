@@ -31,6 +31,8 @@ FEW_REPEATS = 0.01  # share of repeated timestamps that may simply be left out
 MOTION = "motion"  # among what is derived of a log once
 EDGE = 128  # rows either side that derivatives need
 LEAD = 0.5  # s before a row that delays look back to
+TURN = 2 * np.pi
+WITHIN_TURN = TURN + 0.01  # rad: angles beyond it, in degrees or not, do not wrap
 SMALLEST_MOTION = 1e-4  # rad/s, what counts as standing still at least
 
 
@@ -133,6 +135,7 @@ def motion_of(log: Log) -> Motion:
     """Return the motion of a log.
 
     Needs ``actual_q`` or ``target_q``; speeds come from ``actual_qd`` where the log has them.
+    Angles that jump by whole turns run on (``without_turns``).
     A cycle that was recorded twice counts once; timestamps rounded so far that they repeat are
     replaced by an even clock if they fit one (``time_finding`` reports). Raises LogError naming the
     row where time runs backwards or repeats in any other way.
@@ -149,7 +152,56 @@ def with_motion(log: Log, motion: Motion) -> Log:
     return log
 
 
+def without_turns(log: Log) -> Log:
+    """Return the log with angles that run on where they jump by whole turns.
+
+    Encoders may report -pi to pi. Only recordings of motion run on: poses at rest may lie half a
+    turn apart. A joint that ran on has the middle of its range within half a turn of zero, so that
+    it stays within its limits. Commands are moved onto the turn of the encoders, also for poses.
+    ``turned`` of the log names the joints that were changed.
+    """
+    angles = {n: log.columns[n] for n in ("actual_q", "target_q") if log.has(n)}
+    if not angles or not all(np.isfinite(q).all() for q in angles.values()):
+        return log
+    wraps = np.min([np.abs(q).max(axis=0) for q in angles.values()], axis=0) < WITHIN_TURN
+    first, *others = angles
+    turns = {first: np.where(wraps, _turns_passed(log, angles[first]), 0.0)}
+    q = angles[first] + TURN * turns[first]
+    for name in others:
+        turns[name] = np.where(wraps, np.round((q - angles[name]) / TURN), 0.0)
+    turned = np.any([t.any(axis=0) for t in turns.values()], axis=0)
+    if not turned.any():
+        return log
+    columns = {name: angles[name] + TURN * turns[name] for name in angles}
+    joints = tuple((np.flatnonzero(turned) + 1).tolist())
+    return replace(log, columns={**log.columns, **columns}, turned=joints)
+
+
+def _turns_passed(log: Log, q: Array) -> Array:
+    """Return the turns (N, n) to add to the angles of a log; zeros for poses at rest."""
+    turns, time = np.zeros(q.shape), log.get("timestamp")
+    if time is None or not np.isfinite(time).all():
+        return turns
+    session = log.columns["session"] if log.session_names else np.zeros(len(q))
+    for s in np.unique(session):
+        rows = np.flatnonzero(session == s)
+        own, step = q[rows], np.diff(q[rows], axis=0)
+        # within a pause of the recording a joint may have gone as far as that
+        fastest = MAX_JOINT_SPEED * np.diff(time[rows])[:, None]
+        jumps = np.abs(step) > np.maximum(fastest, TURN / 2)
+        speed = log.columns["actual_qd"][rows] if log.has("actual_qd") else None
+        if not jumps.any() or not is_moving(time[rows], own, speed):
+            continue
+        passed = np.zeros(own.shape)
+        passed[1:] = -np.cumsum(np.where(jumps, np.round(step / TURN), 0.0), axis=0)
+        run_on = own + TURN * passed
+        middle = np.round((run_on.max(axis=0) + run_on.min(axis=0)) / 2 / TURN)
+        turns[rows] = np.where(jumps.any(axis=0), passed - middle, 0.0)
+    return turns
+
+
 def _motion_of(log: Log) -> Motion:
+    log = without_turns(log)
     q = log.require("actual_q", "target_q")
     time = log.require("timestamp") if log.has("timestamp") else None
     rows: Any = np.arange(len(q))
@@ -189,6 +241,24 @@ def is_moving(time: Array, q: Array, speed: Array | None = None) -> bool:
     # speeds of zero between poses that differ: each row was taken at rest
     at_rest = speed is not None and float(np.abs(speed).max()) < SMALLEST_MOTION
     return not (at_rest and float(np.median(jump)) > 0.01)
+
+
+def time_stretches(log: Log, count: int) -> Index | None:
+    """Return the number (N,) of each row's stretch of time, ``count`` even ones of a recording.
+
+    Pauses are left out. Neighbours in time share their errors, as repeats of a pose do. None for
+    poses at rest, and where rows are not in time order.
+    """
+    time, q = log.get("timestamp"), log.get("actual_q")
+    q = log.get("target_q") if q is None else q
+    if time is None or q is None or not (np.diff(time) >= 0).all():
+        return None
+    if not is_moving(time, q, log.get("actual_qd")):
+        return None
+    step = np.diff(time)
+    recorded = np.append(0.0, np.cumsum(np.where(step > GAP * np.median(step), 0.0, step)))
+    number = recorded / max(float(recorded[-1]), 1e-9) * count
+    return np.asarray(np.minimum(number.astype(np.int64), count - 1))
 
 
 def time_finding(log: Log) -> LogFinding | None:

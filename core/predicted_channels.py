@@ -12,6 +12,7 @@ from gapbridge.core.dynamics import predict_torque, predict_tracking, predict_wr
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import EDGE, LEAD, Motion, motion_of, with_motion
+from gapbridge.core.rotation import nearest_turn
 
 NO_MASSES = "masses of the links (in the cell's robot)"
 ROWS = 20_000  # predicted at a time
@@ -22,8 +23,8 @@ def predicted_channels(model: Model, log: Log) -> tuple[dict[str, Array], dict[s
 
     ``predicted_torque`` (Nm, joints: ``actual_current_as_torque``), ``predicted_wrench`` (N and Nm,
     flange axes: ``ft_raw_wrench``), ``predicted_q`` (rad: ``actual_q`` under the log's
-    ``target_q``). Rows without derivatives (edges and gaps of a recording) are nan in torque and
-    wrench. Raises LogError where the log holds something unusable.
+    ``target_q``, on the turn of the encoders). Rows without derivatives (edges and gaps of a
+    recording) are nan in torque and wrench. Raises LogError where the log holds something unusable.
     """
     motion = motion_of(log)
     predicted: dict[str, Array] = {}
@@ -42,7 +43,8 @@ def predicted_channels(model: Model, log: Log) -> tuple[dict[str, Array], dict[s
         needs["tracking"] = "target_q"
     else:
         all_rows = np.ones(len(motion), dtype=bool)
-        predicted["predicted_q"] = _at_rows(predict_tracking, model, motion, len(log), all_rows)
+        q = _at_rows(predict_tracking, model, motion, len(log), all_rows)
+        predicted["predicted_q"] = nearest_turn(q, log.require("actual_q", "target_q"))
     return predicted, needs
 
 

@@ -66,6 +66,12 @@ def rotation_vector(matrix: Array) -> Array:
     return vectors
 
 
+def nearest_turn(angles: Array, others: Array) -> Array:
+    """Return angles (any shape), rad, moved by whole turns to within half a turn of others."""
+    turn = 2 * np.pi
+    return np.asarray(angles + turn * np.round((others - angles) / turn))
+
+
 def mean_rotation(vectors: Array) -> Array:
     """Return the mean rotation (3,) of close rotation vectors (N, 3), rad, by their matrices."""
     U, _, Vt = np.linalg.svd(rotation_matrix(vectors).mean(axis=0))

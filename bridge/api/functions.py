@@ -124,6 +124,7 @@ def diagnose(
     from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
     from gapbridge.core.effects import effect_named
     from gapbridge.core.log.alignment import aligned
+    from gapbridge.core.motion import without_turns
 
     for name in withhold:
         effect_named(name)
@@ -133,7 +134,7 @@ def diagnose(
             raise LogError(
                 f"{simulated.path}: found the rows of {log.path}, expected a simulator's log"
             )
-        simulated = at_joints_of(log, aligned(simulated, log), cell)
+        simulated = at_joints_of(log, aligned(without_turns(simulated), log), cell)
     metrology = replace(cell.metrology, remounted=remounted)
     try:
         diagnosis = diagnose_log(

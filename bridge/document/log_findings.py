@@ -24,6 +24,8 @@ TEXTS = {
     LogCheck.REPEATED_TIME: "{0} timestamp(s) are repeated",
     LogCheck.BACKWARD_TIME: "{0} timestamp(s) run backwards (the first is row {1}): rows should be "
     "in time order",
+    LogCheck.WHOLE_TURNS: "joint(s) {0} jump by whole turns, or are commanded on another turn; "
+    "their angles were continued",
     LogCheck.NO_READING: "{0} row(s) have no {1:reading} and were left out",
     LogCheck.POSITIONS_AT_REST: "the measured positions hardly change: is it the right column?",
     LogCheck.FAHRENHEIT: "the joint temperatures look like Fahrenheit, expected °C",

@@ -28,7 +28,7 @@ POSITION, RATE, LIMIT = range(3)  # rows of NominalStream's array
 PEAK_SLOPE = 1.5  # of a smooth step, in units of its mean slope
 ARRIVED = 1e-9  # rad from the goal at which a command has reached it
 LEAD_IN_SHARE = 0.5  # of the offset's rate limit for the lead-in: the offset changes meanwhile
-SOLVED = 1e-5  # m: corrections with a larger residual are not used
+SOLVED = 1e-5  # m: corrections that miss more of what the joints can reach are not used
 DEFAULT_VELOCITY = np.pi  # rad/s: of joints whose limit is not known
 
 
@@ -149,6 +149,8 @@ class SetpointStream:
         self._since_start = 0.0  # s
         self._kept = (0.0, False, 0.0, 0.0)
         self.residual = 0.0  # m, of the last correction
+        self.missed = 0.0  # m of it that the joints could correct
+        self._compensator.missed(np.zeros(model.arm.n), Loads(), 0.0)  # compiles it now
         self.finite = True  # the last correction is finite
         self._loads = Loads()  # of the last correction
         self._solved = np.zeros(model.arm.n + 6)  # joint and TCP offset of the last one solved
@@ -158,6 +160,9 @@ class SetpointStream:
         """Return the correction alone, neither ramped nor limited."""
         correction = self._compensator.correct(nominal_q, loads)
         self.residual = float(correction.residual)
+        self.missed = self.residual
+        if not self.residual < SOLVED:
+            self.missed = self._compensator.missed(nominal_q, loads, self.residual)
         # lists: for twelve numbers faster than arrays
         numbers = correction.q.tolist() + correction.offset_in_base.tolist()
         self.finite = math.isfinite(sum(numbers))
@@ -167,7 +172,7 @@ class SetpointStream:
     @property
     def unsolved(self) -> str:
         """Return why the last correction misses the wanted pose, as text; empty: it does not."""
-        if self.residual < SOLVED:
+        if self.missed < SOLVED:
             return ""
         loads = self._loads
         mass = self._compensator.model.payload_mass
@@ -178,7 +183,7 @@ class SetpointStream:
         if not math.isfinite(self.residual):
             return f"the model finds no equilibrium {under}: are compliance and effects right?"
         return (
-            f"the corrected setpoint stays {1e3 * self.residual:.3g} mm from the wanted pose "
+            f"the corrected setpoint stays {1e3 * self.missed:.3g} mm from the wanted pose "
             f"{under}, expected at most {1e3 * SOLVED:g} mm: a singular pose, or a model that "
             "bends too far"
         )
@@ -252,7 +257,7 @@ class SetpointStream:
             nominal = self._without_start_gap(source_q, usable)
         correction = self.correct(nominal, loads)
         corrected, offset, n = correction.q, correction.offset_in_base, len(nominal)
-        if self.residual < SOLVED:
+        if self.missed < SOLVED:
             self._solved[:n], self._solved[n:] = corrected - nominal, offset
         else:  # the last solved one is ramped out: the loop ends the motion
             corrected, offset = nominal + self._solved[:n], self._solved[n:]

@@ -11,7 +11,7 @@ from multiprocessing import get_context
 import numpy as np
 
 from gapbridge.bridge.loop.setpoint_stream import NominalStream
-from gapbridge.core.arm import builtin_arm
+from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_rows
 from gapbridge.core.compensation import Compensator, correct
 from gapbridge.core.dynamics import with_pieces
 from gapbridge.core.effects import CATALOGUE
@@ -21,6 +21,7 @@ from gapbridge.core.kernels.factor import factor_blocks
 from gapbridge.core.kernels.interpolation import lagged, played
 from gapbridge.core.kernels.rates import of_rows
 from gapbridge.core.limits import Limiter, Limits
+from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of
@@ -60,6 +61,8 @@ def _setpoints() -> None:
     values = (0.0,) * len(looking.parameters(model.arm, site))
     of_angles = model.with_terms([Term(looking.identifier, site, values)])
     Compensator(of_angles).correct(Q[0])  # an effect that looks at the joint angles
+    few = Model(arm_from_dh(builtin_rows("ur10e")["dh"][:5]))
+    Compensator(few).missed(Q[0, :5], Loads(), 0.0)  # arms that cannot reach every pose
     time = np.array([0.0, 0.002, 0.004, 0.006])
     lagged(time, time, 0.1, 0.0)
     played(time, 0.1, 0.0)

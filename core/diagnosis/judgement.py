@@ -452,7 +452,8 @@ def _excess_residual_p(selection: Selection) -> float:
     residual = selection.residual[selection.kept][:, : min(k, 3)]
     freedom = max(residual.size - selection.used, 1.0)
     variance = float(np.sum(residual**2)) / freedom
-    pure, repeats = pure_error(residual, observation.groups[selection.kept])
+    session = None if observation.session is None else observation.session[selection.kept]
+    pure, repeats = pure_error(residual, observation.groups[selection.kept], session)
     if observation.sigma_is_whole:
         least, times = observation.sigma**2, OVER_STATED_NOISE
     elif repeats >= MIN_REPEATS_TO_TEST:
@@ -466,12 +467,18 @@ def _excess_residual_p(selection: Selection) -> float:
     return float(gammaincc(freedom / 2, freedom * variance / least / 2))
 
 
-def pure_error(residual: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
+def pure_error(
+    residual: Array, groups: NDArray[np.int64], session: NDArray[np.int64] | None = None
+) -> tuple[float, int]:
     """Return the variance of one coordinate among repeats of a pose, and its degrees of freedom.
 
     Repeats under other loads count too: the residual of a good model does not depend on them.
+    Those of other sessions do not: each session has a frame of its own, in error by itself.
     """
     total, freedom = 0.0, 0
+    if session is not None:
+        groups = np.unique(np.column_stack([groups, session]), axis=0, return_inverse=True)[1]
+        groups = groups.reshape(-1)
     for group in np.unique(groups):
         part = residual[groups == group]
         if len(part) > 1:

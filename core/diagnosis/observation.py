@@ -77,16 +77,18 @@ class Observation:
         return self.joint_columns * self.axial_moment[:, None, :]
 
 
-def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Observation:
+def stacked(
+    parts: Sequence[Observation], quantities: Mapping[str, Array], groups: NDArray[np.int64]
+) -> Observation:
     """Return the observations of several sessions as one, with a nuisance for each.
 
-    ``quantities`` are those of all samples; ``rows`` of the parts are rows of the joined log.
+    ``quantities`` and ``groups`` (N,) are those of all samples: a pose that several sessions
+    repeat is one condition. ``rows`` of the parts are rows of the joined log.
     """
     size = [len(part.rows) for part in parts]
     width = [part.nuisance.shape[2] for part in parts]
     session = [0 if part.session is None else int(part.session[0]) for part in parts]
     columns = np.cumsum([0, *width])
-    group_ends = np.cumsum([0, *(int(part.groups.max()) + 1 for part in parts)])
 
     def together(name: str) -> Array | None:
         columns = [getattr(part, name) for part in parts]
@@ -113,7 +115,7 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
             name = f"measured_position_{k}"
             if name in quantities:
                 changed[name] = np.concatenate([m.measured[:, k] for m in moved])
-        return stacked(moved, changed)
+        return stacked(moved, changed, groups)
 
     return replace(
         parts[0],
@@ -121,7 +123,7 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
         predict=predict,
         nuisance=_block_diagonal([part.nuisance for part in parts]),
         quantities=quantities,
-        groups=np.concatenate([p.groups + g for p, g in zip(parts, group_ends, strict=False)]),
+        groups=groups,
         rows=np.concatenate([part.rows for part in parts]),
         joint_columns=together("joint_columns"),
         unnamed=unnamed,

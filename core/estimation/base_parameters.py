@@ -17,6 +17,7 @@ import numpy as np
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.effects import flexibility_names
 from gapbridge.core.estimation.compliance_fit import ProjectedSystem, solve
+from gapbridge.core.estimation.robust import TINY
 from gapbridge.core.notes import Note, Reason
 
 MAX_RELATIVE_STD = 0.3  # of the prior's sigma; beyond it a flexibility is not identifiable
@@ -32,10 +33,32 @@ class Identifiable:
     kept: Mask  # (2n,) fitted; the others are fixed at the model's value
     covariance: Array  # (2n, 2n), (rad/Nm)^2: of the kept ones; the prior's variance of the others
     notes: tuple[Note, ...]  # what is not identifiable, or only in combination
+    noise: float  # of the residual, over the one that the rows were divided by
 
 
-def choose_identifiable(linear: ProjectedSystem, prior: tuple[Array, float]) -> Mask:
-    """Return the flexibilities (2n,) that are identifiable with the others fixed."""
+def residual_noise(
+    linear: ProjectedSystem, values: Array, kept: Mask, sigma: float, spare: float
+) -> float:
+    """Return the noise of a fit's residual per degree of freedom, over that of the system's rows.
+
+    That one is a median of gaps, which the fitted parameters make smaller. ``values`` (2n,) are the
+    fit's, ``sigma`` the prior's (rad/Nm), ``spare`` the equations less the nuisances.
+    """
+    free = kept & (values > 0)
+    size = np.linalg.svd(linear.matrix[:, free] * sigma, compute_uv=False) ** 2
+    left = linear.matrix @ values - linear.right
+    freedom = max(spare - float(np.sum(size / (size + 1))), 1.0)
+    return max(float(np.sqrt(left @ left / freedom)), TINY)
+
+
+def choose_identifiable(
+    linear: ProjectedSystem, prior: tuple[Array, float], noise: float = 1.0
+) -> Mask:
+    """Return the flexibilities (2n,) that are identifiable with the others fixed.
+
+    ``noise`` is the ``residual_noise``.
+    """
+    linear = linear.over(noise)
     kept = np.ones(len(prior[0]), dtype=bool)
     while kept.any():
         undetermined = np.flatnonzero(kept)[
@@ -74,9 +97,14 @@ def _cost_without(
     return float(remaining @ remaining + np.sum(((solution - prior[0]) / prior[1]) ** 2))
 
 
-def identifiability_of(linear: ProjectedSystem, kept: Mask, sigma: float) -> Identifiable:
-    """Return covariance and notes of the chosen flexibilities; sigma is the prior's (rad/Nm)."""
-    count = len(kept)
+def identifiability_of(
+    linear: ProjectedSystem, kept: Mask, sigma: float, noise: float = 1.0
+) -> Identifiable:
+    """Return covariance and notes of the chosen flexibilities.
+
+    ``sigma`` is the prior's (rad/Nm), ``noise`` the ``residual_noise``.
+    """
+    linear, count = linear.over(noise), len(kept)
     covariance = np.diag(np.full(count, sigma**2))
     root = _covariance_root(linear, kept, sigma) * sigma
     covariance[np.ix_(kept, kept)] = root @ root.T
@@ -85,7 +113,7 @@ def identifiability_of(linear: ProjectedSystem, kept: Mask, sigma: float) -> Ide
     notes += _identifiable_combinations(columns, kept)
     names = flexibility_names(count // 2)
     notes += correlated_pairs(covariance, kept, names)
-    return Identifiable(kept, covariance, tuple(notes))
+    return Identifiable(kept, covariance, tuple(notes), noise)
 
 
 def _held_note(i: int, columns: Array, kept: Mask) -> Note:

@@ -51,14 +51,15 @@ class Data:
     session: NDArray[np.int64] | None = None  # (N,) session of each row; None: there is one
     sessions: int = 1  # number of sessions in the whole data
     remounted: bool = False  # each session has a separate tool point
+    stretch: NDArray[np.int64] | None = None  # (N,) of time, in a recording of motion
 
     def part(self, rows: NDArray[Any] | slice) -> Data:
         """Return some of the rows."""
         rotation = None if self.rotation is None else self.rotation[rows]
-        session = None if self.session is None else self.session[rows]
+        session, stretch = (c if c is None else c[rows] for c in (self.session, self.stretch))
         return replace(
             self, q=self.q[rows], loads=self.loads[rows], position=self.position[rows],
-            rotation=rotation, session=session,
+            rotation=rotation, session=session, stretch=stretch,
         )  # fmt: skip
 
     @property
@@ -96,6 +97,10 @@ class ProjectedSystem:
 
     matrix: Array  # (2n+1, 2n) per rad/Nm
     right: Array  # (2n+1,)
+
+    def over(self, noise: float) -> ProjectedSystem:
+        """Return the system of a noise that is larger by this factor."""
+        return ProjectedSystem(self.matrix / noise, self.right / noise)
 
 
 @dataclass(frozen=True)

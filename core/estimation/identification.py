@@ -33,13 +33,14 @@ from gapbridge.core.estimation.compliance_fit import (
     with_free_geometry,
 )
 from gapbridge.core.estimation.geometry import TOOL_STD, Geometry
-from gapbridge.core.estimation.held_out import FOLDS, joint_regions, pose_groups, random_folds
+from gapbridge.core.estimation.held_out import FOLDS, joint_regions, random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
-from gapbridge.core.estimation.pose_scatter import with_pose_scatter
+from gapbridge.core.estimation.pose_scatter import POSE_PARTS, error_groups, with_pose_scatter
 from gapbridge.core.estimation.registration import IDENTITY, Registration
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
+from gapbridge.core.motion import time_stretches
 from gapbridge.core.notes import Note, Reason
 from gapbridge.core.rotation import rotation_matrix
 from gapbridge.core.sessions import session_of
@@ -106,12 +107,23 @@ class _FitSettings:
         all_free = np.ones(len(centre), dtype=bool)
         first = fit_flexibilities(before, data, all_free, self.prior, self.rounds, self.converged)
         assert first.linear is not None
-        kept = base_parameters.choose_identifiable(first.linear, self.prior)
+        noise = self._noise(first, data, all_free)
+        kept = base_parameters.choose_identifiable(first.linear, self.prior, noise)
         values, n = np.where(kept, first.flexibility, centre), len(centre) // 2
         begin = replace(first, model=first.model.with_compliance(values[:n], values[n:]))
         fit = fit_flexibilities(begin, data, kept, self.prior, converged=self.converged)
         assert fit.linear is not None
-        return fit, base_parameters.identifiability_of(fit.linear, kept, self.prior[1])
+        noise = self._noise(fit, data, kept)
+        return fit, base_parameters.identifiability_of(fit.linear, kept, self.prior[1], noise)
+
+    def _noise(self, fit: Fit, data: Data, kept: Mask) -> float:
+        """Return the noise of a fit's residual over the robust one."""
+        assert fit.linear is not None
+        width = 3 if data.rotation is None else 6
+        spare = width * float(fit.weights.sum()) - data.nuisances
+        return base_parameters.residual_noise(
+            fit.linear, fit.flexibility, kept, self.prior[1], spare
+        )
 
 
 def identify_compliance(
@@ -168,7 +180,11 @@ def measured_rows(
         finite &= np.isfinite(rotation).all(axis=1)
     used = np.flatnonzero(finite)
     matrix = None if rotation is None else rotation_matrix(rotation[used])
-    return Data(q[used], log.loads(motions)[used], measured[used], matrix, registered), used
+    stretch = time_stretches(log, POSE_PARTS)
+    return Data(
+        q[used], log.loads(motions)[used], measured[used], matrix, registered,
+        stretch=None if stretch is None else stretch[used],
+    ), used  # fmt: skip
 
 
 def data_of(log: Log, metrology: Metrology, motions: bool = True) -> tuple[Data, NDArray[np.int64]]:
@@ -280,7 +296,7 @@ def _held_out_rms(
     data: Data, settings: _FitSettings, whole: tuple[Fit, Fit], inlier: Mask
 ) -> tuple[float, float]:
     """Return the rms before and after over inlier rows of poses left out; nan: too few poses."""
-    groups = pose_groups(data.q)
+    groups = error_groups(data)
     if int(groups.max()) + 1 < 2 * FOLDS:
         return NOT_AVAILABLE, NOT_AVAILABLE
     fold = random_folds(groups)

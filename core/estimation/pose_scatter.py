@@ -1,7 +1,8 @@
 """Cluster-robust covariance of the flexibilities, by a jackknife over poses.
 
 The errors of one pose are correlated: joint errors (repeatability, encoder rounding) act on all six
-coordinates through the Jacobian, and grow with the lever.
+coordinates through the Jacobian, and grow with the lever. So are those of neighbours in time in a
+recording of motion.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapbridge.core.arrays import Array
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.estimation.base_parameters import Identifiable
 from gapbridge.core.estimation.compliance_fit import (
     Data,
@@ -29,6 +30,11 @@ MAX_ROWS = 2000  # used for the jackknife
 MIN_PARTS_FACTOR = 2  # coordinates of groups over fitted parameters; with fewer: white noise
 
 
+def error_groups(data: Data) -> Index:
+    """Return the group (N,) of each row, with errors in common: its stretch of time, or pose."""
+    return pose_groups(data.q) if data.stretch is None else data.stretch
+
+
 def with_pose_scatter(fit: Fit, data: Data, shown: Identifiable, sigma: float) -> Identifiable:
     """Return the identifiability with the covariance (2n, 2n) by fits without groups of poses.
 
@@ -38,8 +44,9 @@ def with_pose_scatter(fit: Fit, data: Data, shown: Identifiable, sigma: float) -
     kept, count = shown.kept, int(shown.kept.sum())
     sample = data.part(one_of_each_stretch(len(data.q), MAX_ROWS))
     A, b, prior = _rows(fit, sample, shown, sigma)
+    A, b = A / shown.noise, b / shown.noise
     width = len(b) // len(sample.q)
-    parts = random_folds(pose_groups(sample.q), POSE_PARTS)
+    parts = random_folds(error_groups(sample), POSE_PARTS)
     if not count or (int(parts.max()) + 1) * width < MIN_PARTS_FACTOR * A.shape[1]:
         return shown
     flexible = np.arange(A.shape[1] - count, A.shape[1])

@@ -134,7 +134,8 @@ class _Fitting:
             noise = scale_of(now, stream.sample)
             rows = accumulate(now, noise, stream)
             R = merged_factor(rows.factors)
-            result, kept, linear = self.step(now, R, stream.nuisances, kept)
+            spare = rows.equations - stream.nuisances
+            result, kept, linear = self.step(now, R, stream.nuisances, spare, kept)
             change = np.abs(result.flexibility - now.flexibility)
             base, now = now, result
             if change.max() < CONVERGED * max(np.abs(now.flexibility).max(), 1e-12):
@@ -142,23 +143,31 @@ class _Fitting:
             if long and (change[kept] < STEP_CONVERGED * _spread(linear, kept)).all():
                 break
         assert kept is not None
-        shown = base_parameters.identifiability_of(linear, kept, self.prior[1])
+        left = base_parameters.residual_noise(
+            linear, now.flexibility, kept, self.prior[1], spare
+        )  # fmt: skip
+        shown = base_parameters.identifiability_of(linear, kept, self.prior[1], left)
         return _StreamedFit(now, noise, base, rows, shown)
 
     def step(
-        self, state: Fit, R: Array, nuisances: int, kept: Mask | None = None
+        self, state: Fit, R: Array, nuisances: int, spare: float, kept: Mask | None = None
     ) -> tuple[Fit, Mask, ProjectedSystem]:
         """Return the fit after one step, the kept flexibilities and the projected system.
 
-        ``R`` is the factor of the fitted rows, linearised at ``state``; ``kept`` None: chosen here.
+        ``R`` is the factor of the fitted rows, linearised at ``state``; ``kept`` None: chosen here,
+        by the noise of the residual for ``spare`` equations more than nuisances.
         """
         F, A, b = R[:, :nuisances], R[:, nuisances:-1], R[:, -1]
         centre, n = self.prior[0], state.model.arm.n
         all_free = np.ones(len(centre), dtype=bool)
-        linear = gauss_newton_step(state, (F, A, b), NO_WEIGHTS, all_free, self.prior).linear
+        first = gauss_newton_step(state, (F, A, b), NO_WEIGHTS, all_free, self.prior)
+        linear = first.linear
         assert linear is not None
         if kept is None:
-            kept = base_parameters.choose_identifiable(linear, self.prior)
+            noise = base_parameters.residual_noise(
+                linear, first.flexibility, all_free, self.prior[1], spare
+            )
+            kept = base_parameters.choose_identifiable(linear, self.prior, noise)
         begin = np.where(kept, state.flexibility, centre)
         solution = solve(linear, kept, begin, self.prior)
         placed = with_nuisance_step(state, b - A @ (solution - state.flexibility), F)
@@ -241,7 +250,7 @@ class _GeometryFit:
     ) -> base_parameters.Identifiable:
         """Return the identifiability by all rows, plus the covariance due to the geometry."""
         wide, narrow = (
-            base_parameters.identifiability_of(system, shown.kept, sigma).covariance
+            base_parameters.identifiability_of(system, shown.kept, sigma, shown.noise).covariance
             for system in (self.free, self.fixed)
         )
         return replace(shown, covariance=shown.covariance + wide - narrow)
@@ -324,6 +333,7 @@ def _held_out(
     Fits without a fold are one step from the fit to all rows, whose shape and weights they share.
     """
     sums, cells, nuisances = np.zeros(2), 0, stream.nuisances
+    spare = result.rows.equations * (1 - 1 / FOLDS) - nuisances
     gap = residual(result.fit.model, stream.sample, result.fit.frame)[0]
     inlier = weights_at(gap, result.noise) > 0
     factors = accumulate(before, scale_of(before, stream.sample), stream.sample_only()).factors
@@ -336,7 +346,7 @@ def _held_out(
         fits = (
             with_nuisance_step(before, R[:, -1], R[:, :nuisances]),
             result.written(
-                fitting.step(result.base, remaining, nuisances)[0],
+                fitting.step(result.base, remaining, nuisances, spare)[0],
                 stream.sample.part(stream.fold != k),
             ),
         )

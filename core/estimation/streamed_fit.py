@@ -45,6 +45,7 @@ class Accumulated:
 
     factors: Array  # (FOLDS, k, k) R factors of each fold's rows
     inlier: list[Mask]  # piece by piece
+    equations: float  # sum of their weights
     square: float  # m2, sum over the inliers' gaps of position
 
 
@@ -89,6 +90,7 @@ def accumulate(fit: Fit, scale: Array, stream: Stream) -> Accumulated:
     """
     k = stream.nuisances + 2 * fit.model.arm.n + 1
     factors, inliers, square = np.zeros((FOLDS, k, k)), list[Mask](), 0.0
+    equations = 0.0
     for piece in stream.pieces():
         gap, _ = residual(fit.model, piece.data, fit.frame)
         weights = weights_at(gap, scale)
@@ -96,8 +98,9 @@ def accumulate(fit: Fit, scale: Array, stream: Stream) -> Accumulated:
         for fold, rows in piece.folds:
             add_rows(fit.model, piece.data.part(rows), gap[rows], cells[rows], factors[fold])
         inliers.append(weights > 0)
+        equations += stream.width * float(weights.sum())
         square += float(np.sum(gap[inliers[-1], :3] ** 2))
-    return Accumulated(factors, inliers, square)
+    return Accumulated(factors, inliers, equations, square)
 
 
 def with_nuisance_step(fit: Fit, residual: Array, F: Array) -> Fit:

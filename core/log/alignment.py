@@ -11,6 +11,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.sources.resampling import Stream
+from gapbridge.core.rotation import nearest_turn
 
 POSE = "actual_TCP_pose"
 SAME = 1e-3  # s between two stamps of one row
@@ -21,16 +22,20 @@ APART = {"target_q": 0.01, "actual_q": 0.1}  # rad that a joint may be off: arms
 def aligned(simulated: Log, log: Log) -> Log:
     """Return the simulator's rows at the rows of ``log``; its TCP is ``measured_position``.
 
-    Its rotation, where it has one, is ``measured_rotation``. If both have a ``timestamp``, each row
-    gets the simulator's values at its time, interpolated between rows that are close in time;
-    clocks with a constant difference over all rows count as equal. Otherwise rows correspond by
-    number. Raises LogError where a row has no counterpart, or another pose.
+    Its rotation, where it has one, is ``measured_rotation``; its joint angles are on the turns of
+    ``log``. If both have a ``timestamp``, each row gets the simulator's values at its time,
+    interpolated between rows that are close in time; clocks with a constant difference over all
+    rows count as equal. Otherwise rows correspond by number. Raises LogError where a row has no
+    counterpart, or another pose.
     """
     simulated = _with_position(simulated)
     clocks = log.has("timestamp") and simulated.has("timestamp") and log.one_clock
     found = _by_time(simulated, log) if clocks else _by_row(simulated, log)
     for name, most in APART.items():
         if found.has(name) and log.has(name):
+            angles = nearest_turn(found.require(name), log.require(name))
+            if (angles != found.columns[name]).any():
+                found = replace(found, columns={**found.columns, name: angles})
             _check_motion(found, log, name, most)
     return found
 

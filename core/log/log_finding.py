@@ -18,6 +18,7 @@ class LogCheck(Enum):
     AMBIGUOUS_TIME = auto()  # line of the first, its time (s), rows that repeat, all rows
     REPEATED_TIME = auto()  # rows
     BACKWARD_TIME = auto()  # rows, line of the first
+    WHOLE_TURNS = auto()  # joints
     NO_READING = auto()  # rows, column
     POSITIONS_AT_REST = auto()
     FAHRENHEIT = auto()

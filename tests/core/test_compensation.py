@@ -86,6 +86,28 @@ def test_a_stretched_arm_cannot_reach_where_it_sags_from_and_reports_how_much_is
     assert 1e-4 < found.residual[0] < distance(SIX, np.zeros((1, 6)), np.zeros((1, 6)))[0]
 
 
+@pytest.mark.parametrize("terms", [(), (Term("joint_offset", Site(2), (1e-3,)),)])
+@pytest.mark.parametrize("n", [3, 4, 5, 6, 7])
+def test_what_few_joints_cannot_correct_counts_apart_from_what_they_missed(n, terms):
+    arm = arm_from_dh(SEVEN if n == 7 else builtin_rows("ur10e")["dh"][:n])
+    model = Model(arm, payload_mass=5.0).with_compliance([5e-6] * n, [5e-6] * n).with_terms(terms)
+    live, rng = Compensator(model), np.random.default_rng(n)
+    for q in rng.uniform(0.3, 1.2, (20, n)):
+        found = live.correct(q)
+        jacobian = model.linear_form(found.q[None]).jacobian[0] * np.repeat([1, LEVER], 3)[:, None]
+        real, wanted = model.predict(found.q[None]), wanted_pose(model, q)
+        turn = rotation_vector(wanted.rotation[0] @ real.rotation[0].T)
+        error = np.append(wanted.position[0] - real.position[0], LEVER * turn)
+        basis = np.linalg.svd(jacobian, full_matrices=False)[0]
+        missed = live.missed(q, Loads(), found.residual)
+        assert missed == pytest.approx(np.linalg.norm(basis.T @ error), abs=1e-9)
+        assert missed < 1e-6
+        assert (found.residual > 1e-5) == (n < 6)
+    away = live.correct(q)
+    live._offset[0] += 1e-3  # a solution that was not found
+    assert live.missed(q, Loads(), away.residual) > 1e-5 or n >= 6
+
+
 @pytest.mark.parametrize("n", [6, 7])
 def test_a_rigid_arm_gets_no_offset(n):
     rigid = MODELS[n].without_terms()

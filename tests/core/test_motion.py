@@ -11,7 +11,7 @@ import pytest
 from gapbridge.core.derivatives import differentiate, signal_noise
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
-from gapbridge.core.motion import motion_of, time_finding
+from gapbridge.core.motion import motion_of, time_finding, without_turns
 
 COURSE = truth.course(6, 1)
 ENCODER = 1.2e-5  # rad
@@ -197,3 +197,45 @@ def test_held_samples_do_not_keep_the_windows_short():
     error = (motion.qdd - COURSE.at(t, 2))[motion.valid]
     assert motion.valid.mean() > 0.8
     assert np.sqrt(np.mean(error**2)) < 0.1
+
+
+def wrapped(q):
+    return (q + np.pi) % (2 * np.pi) - np.pi
+
+
+@pytest.mark.parametrize("middle", [np.pi, -np.pi, 0.5 * np.pi - 6.0])
+def test_angles_that_wrap_run_on_within_limits_of_two_turns(middle):
+    t = np.arange(5000) / 500
+    q = COURSE.at(t)
+    q[:, 5] += middle - q[:, 5].mean()
+    jumps = truth.log_of(6, timestamp=t, target_q=q, actual_q=wrapped(q))
+    log, motion = without_turns(jumps), motion_of(jumps)
+    assert 6 in log.turned
+    for values in (log.columns["actual_q"], motion.q):
+        np.testing.assert_allclose(np.diff(values, axis=0), np.diff(q, axis=0), atol=1e-12)
+        assert np.abs(values).max() <= 2 * np.pi
+    np.testing.assert_allclose(motion.target_q, motion.q, atol=1e-9)
+    assert np.abs(motion.qd[motion.valid]).max() < 1.1 * np.abs(COURSE.at(t, 1)).max()
+    assert without_turns(log) is log
+
+
+def test_a_joint_that_was_away_in_a_pause_has_not_wrapped():
+    t, log = recording(125, 10)
+    q = log.columns["actual_q"] + np.where(t > 5, 4.0, 0.0)[:, None]
+    paused = t + np.where(t > 5, 3.0, 0.0)
+    log = truth.log_of(6, timestamp=paused, actual_q=q)
+    assert without_turns(log) is log
+
+
+def test_poses_at_rest_stay_and_their_commands_are_on_the_turn_of_the_encoders():
+    q = truth.poses(6, 30, 0) * 1.5
+    at_rest = truth.log_of(6, timestamp=np.arange(30) * 5.0, target_q=wrapped(q), actual_q=q + 1e-4)
+    log = without_turns(at_rest)
+    np.testing.assert_array_equal(log.columns["actual_q"], q + 1e-4)
+    np.testing.assert_allclose(log.columns["target_q"], q, atol=1e-12)
+
+
+def test_degrees_do_not_wrap():
+    t, log = recording(25, 10)
+    degrees = truth.log_of(6, timestamp=t, actual_q=np.degrees(log.columns["actual_q"]) * 3)
+    assert without_turns(degrees) is degrees

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,3 +54,17 @@ def test_every_row_comes_once_with_its_line_and_predicted_as_in_the_whole(log: L
 def test_a_short_log_comes_as_a_whole(log: Log) -> None:
     ((around, own),) = with_neighbours(ragged(log), COUNT)
     assert (len(around), own) == (COUNT, slice(0, COUNT))
+
+
+def test_encoders_that_wrap_are_predicted_as_they_are_recorded(log: Log) -> None:
+    whole, _ = predicted_channels(MODEL, log)
+    q = log.columns["actual_q"] + [0, 0, 0, 0, 0, np.pi]
+    wrapped = (q + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(np.diff(wrapped, axis=0)).max() > 6
+    found, _ = predicted_channels(
+        MODEL, replace(log, columns={**log.columns, "target_q": q, "actual_q": wrapped})
+    )
+    gap = whole["predicted_q"] - log.columns["actual_q"]
+    np.testing.assert_allclose(found["predicted_q"] - wrapped, gap, atol=1e-9)
+    good = np.isfinite(whole["predicted_torque"])
+    np.testing.assert_array_equal(np.isfinite(found["predicted_torque"]), good)

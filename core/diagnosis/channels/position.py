@@ -79,7 +79,8 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     together = quantities(log, rows) | approaches(log.loads().approach, rows)
     for k in range(3):  # the sessions' frames differ: positions compare in base only
         together[f"measured_position_{k}"] = np.concatenate([p.measured[:, k] for p in parts])
-    return stacked(parts, together)
+    q = log.require("actual_q", "target_q")[rows]
+    return stacked(parts, together, pose_groups(q))
 
 
 def _numbered(observation: Observation, session: int, rows: NDArray[np.int64]) -> Observation:

@@ -19,7 +19,7 @@ from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
-from gapbridge.core.motion import motion_of, with_motion
+from gapbridge.core.motion import motion_of, with_motion, without_turns
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
@@ -39,7 +39,7 @@ def joined(log: Log, simulated: Log) -> Log:
     Raises LogError where a row has no counterpart or one of another pose, or the simulator's has
     nothing to compare.
     """
-    simulated = aligned(simulated, log)
+    simulated = aligned(without_turns(simulated), log)
     predictions = {
         PREFIX + name: simulated.require(name)
         for name in (*COLUMN_OF_CHANNEL.values(), ROTATION)

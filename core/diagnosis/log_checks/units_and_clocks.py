@@ -135,7 +135,8 @@ def findings(
 
     With ``model`` also on joint limits, number of poses, frames and signs.
     """
-    listed = [*_names(log), *_times(log), *_gaps(log)]
+    turned = [LogFinding(LogCheck.WHOLE_TURNS, (log.turned,))] if log.turned else []
+    listed = [*_names(log), *_times(log), *turned, *_gaps(log)]
     measured = log.get("measured_position")
     at_rest = False
     if measured is not None and len(measured) > 3 and np.isfinite(measured).any():

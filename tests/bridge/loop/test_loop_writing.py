@@ -90,13 +90,14 @@ class Stream(SetpointStream):
     """A stream whose model can be made to give no numbers."""
 
     broken = False
-    unsolvable = 0.0  # m: the residual instead
+    unsolvable = 0.0  # m: what is missed instead
 
     def correct(self, nominal_q: np.ndarray, loads: Loads) -> Correction:
         found = super().correct(nominal_q, loads)
         if self.broken:
-            self.residual, self.finite = np.nan, False
-        self.residual = self.unsolvable or self.residual
+            self.residual, self.missed, self.finite = np.nan, np.nan, False
+        if self.unsolvable:
+            self.residual = self.missed = self.unsolvable
         return found
 
 

@@ -14,7 +14,7 @@ from gapbridge.bridge.loop.setpoint_stream import (
     SetpointStream,
     limits_of,
 )
-from gapbridge.core.arm import builtin_arm
+from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_rows
 from gapbridge.core.compensation import Correction, correct
 from gapbridge.core.errors import LimitError, StaleStateError
 from gapbridge.core.loads import Loads
@@ -75,6 +75,21 @@ def test_the_offset_ramps_in_to_the_whole_correction_and_out_to_none() -> None:
     assert end.q == pytest.approx(Q, abs=1e-15)
     assert run.stream.at_rest
     assert np.abs(run.steps()).max() < 1e-4
+
+
+def test_an_arm_of_five_joints_gets_the_offset_that_it_can_make() -> None:
+    arm = arm_from_dh(builtin_rows("ur10e")["dh"][:5])
+    five = Model(arm, payload_mass=5.0).with_compliance(np.full(5, 5e-6), np.full(5, 5e-6))
+    stream, q = SetpointStream(five, LimitSettings(), 500.0, clock=SYSTEM), Q[:5]
+    stream.start(q, 100.0)
+    for k in range(400):
+        found = stream.advance(
+            RobotState(100.0 + k * CYCLE, 0.0, q, np.zeros(5), q, np.zeros(5)), q, LIGHT, 1.0
+        )
+    assert stream.unsolved == ""
+    assert stream.residual > 1e-5
+    assert found.q == pytest.approx(correct(five, q[None], LIGHT).q[0], abs=1e-7)
+    assert np.abs(found.q - q).max() > 1e-4
 
 
 def test_a_correction_that_misses_is_not_sent_and_the_last_solved_one_ramps_out(

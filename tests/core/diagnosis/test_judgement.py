@@ -230,6 +230,8 @@ def test_repeats_show_the_noise_whatever_the_poses_are_off_by(seed, sigma, pairs
     assert np.sqrt(variance) == pytest.approx(sigma, rel=0.25)
     assert pure_error(poses, groups)[0] == pytest.approx(0, abs=1e-20)
     assert pure_error(noise, np.arange(3 * pairs)) == (0.0, 0)
+    session = np.tile(np.arange(3), pairs)  # each pose once a session: no repeats
+    assert pure_error(noise, groups, session) == (0.0, 0)
 
 
 @pytest.mark.parametrize("effect", ["backlash", "tool_frame", "thermal_drift"])

@@ -17,10 +17,13 @@ from gapbridge.bridge.api.uncertainty import cause_entries
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text
 from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.across_sessions import SessionTransfer, session_transfer
+from gapbridge.core.diagnosis.channels.position import observe
 from gapbridge.core.diagnosis.diagnosis import _slips, diagnose
 from gapbridge.core.diagnosis.model_terms import terms_with_stand_ins
+from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
+from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
@@ -147,6 +150,24 @@ def test_one_session_has_no_figure_for_a_new_one() -> None:
     assert found.by_session == ()
     assert found.new_region is not None
     assert 0.8 * small.FLOOR < found.new_region < 1.3 * small.FLOOR
+
+
+def test_a_pose_that_sessions_repeat_is_one_condition() -> None:
+    """Held out in one session and fitted in another, the pose would have been seen."""
+    drawn, rng = small.session_of(3, small.Plan(poses=14)), np.random.default_rng(0)
+    there = small.readings(small.NOMINAL, drawn)
+    logs = [
+        replace(small.log_of(drawn, there + rng.normal(0, 1e-5, there.shape)), path=f"{s}.csv")
+        for s in range(3)
+    ]
+    log = join_sessions(logs, MODEL)
+    seen = observe(MODEL, log, Metrology())
+    assert isinstance(seen, Observation)
+    moved = seen.rebased(np.full(seen.nuisance.shape[2], 1e-6), ())
+    conditions = pose_groups(log.columns["actual_q"])
+    assert len(set(conditions)) == 14 < len(log)
+    for observation in (seen, moved):
+        np.testing.assert_array_equal(observation.groups, conditions)
 
 
 def test_a_session_too_short_for_its_frame_is_refused() -> None:

@@ -8,6 +8,7 @@ from gapbridge.core.estimation.base_parameters import (
     VISIBLE,
     choose_identifiable,
     identifiability_of,
+    residual_noise,
 )
 from gapbridge.core.estimation.compliance_fit import ProjectedSystem
 from gapbridge.core.notes import Note, Reason
@@ -34,6 +35,19 @@ def test_what_has_columns_of_its_own_is_kept_and_the_empty_ones_are_held():
     std = np.sqrt(np.diag(shown.covariance)) / SIGMA
     np.testing.assert_allclose(std[:2], [1 / 50, 1 / 20], rtol=2e-3)
     np.testing.assert_array_equal(std[2:], 1)
+
+
+def test_the_noise_of_a_residual_is_per_degree_of_freedom():
+    rng, every, variance = np.random.default_rng(0), np.ones(4, dtype=bool), []
+    for _ in range(300):
+        A, values = rng.normal(size=(7, 4)) * 50, np.full(4, 1.0)
+        b = A @ values + rng.normal(0, 3.0, 7)
+        linear = ProjectedSystem(A / SIGMA, b)
+        best = np.linalg.lstsq(A, b, rcond=None)[0] * SIGMA
+        variance.append(residual_noise(linear, best, every, SIGMA, 7.0) ** 2)
+    assert np.mean(variance) == pytest.approx(9.0, rel=0.1)
+    shown, wide = (identifiability_of(linear, every, SIGMA, noise) for noise in (1.0, 3.0))
+    np.testing.assert_allclose(np.diag(wide.covariance), 9 * np.diag(shown.covariance), rtol=0.01)
 
 
 def test_two_that_act_alike_are_carried_by_one_and_both_are_named():

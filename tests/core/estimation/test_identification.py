@@ -115,6 +115,19 @@ def test_intervals_hold_where_joints_are_off_at_all_repeats_of_a_pose(repeats):
     assert 0.7 < np.sqrt(np.mean(np.square(np.concatenate(z)))) < 1.2
 
 
+def test_intervals_of_few_poses_count_the_frame_and_tool_point_that_are_fitted_too():
+    """What is fitted to ten poses leaves gaps a good deal smaller than the noise."""
+    z = []
+    for seed in range(16):
+        planted, columns = truth(6, 10, 70 + seed, rotation=False)
+        found = identify_compliance(model_of(6), log_of(6, columns), Metrology(registered=False))
+        std = np.concatenate([found.std_axial, found.std_radial])
+        values = np.concatenate([found.axial, found.radial])
+        free = found.identifiable & (values > 0)
+        z.append(((values - planted) / std)[free])
+    assert 0.7 < np.sqrt(np.mean(np.square(np.concatenate(z)))) < 1.3
+
+
 def test_a_frame_that_nobody_registered_is_found_along():
     planted, columns = truth(6, 60, 3, noise=0.0)
     turn, shift = rotation_matrix(np.array([0.4, -1.0, 2.0])), np.array([1.0, -2.0, 0.5])

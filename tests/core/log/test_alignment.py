@@ -74,3 +74,10 @@ def test_a_urs_own_pose_is_the_simulated_position() -> None:
     found = aligned(simulated, log).columns
     np.testing.assert_array_equal(found["measured_position"], pose[:, :3])
     np.testing.assert_array_equal(found["measured_rotation"], pose[:, 3:])
+
+
+def test_a_simulator_may_count_angles_on_another_turn() -> None:
+    log, simulated = moving(T), moving(T)
+    simulated.columns["target_q"][50:] += 2 * np.pi
+    found = aligned(simulated, log)
+    np.testing.assert_allclose(found.columns["target_q"], log.columns["target_q"], atol=1e-12)

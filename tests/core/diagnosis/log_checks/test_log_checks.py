@@ -107,6 +107,11 @@ def test_without_a_rated_payload_grams_are_detected_by_the_arms_mass():
     check_units(weightless, with_columns(payload=SESSION.payload_mass * 1e3))
 
 
+def test_joints_that_were_moved_by_whole_turns_are_named():
+    (line,) = findings(replace(LOG, turned=(2, 6)), MODEL, REGISTERED)
+    assert "joint(s) 2, 6 jump by whole turns" in line
+
+
 def test_fahrenheit_is_reported():
     assert "Fahrenheit" in reported(with_columns(joint_temperatures=SESSION.temperature * 1.8 + 70))
 
