@@ -19,6 +19,8 @@ from gapbridge.core.state import CLAMPS, ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, RA
 
 MAX_GAP_CYCLES = 5.0  # of the time between setpoints that counts for the rate limits
 MAX_MAGNITUDE = 1e6  # rad, m, of any number of a setpoint
+# m, rad, rad: the largest offsets that any cell may allow, and so the largest in force at a start
+MAX_OFFSET, MAX_OFFSET_ROTATION, MAX_JOINT_OFFSET = 0.1, 0.5, 0.5
 SCALARS = 7  # scalar limits, first in the limiter's block
 SLACK = 1.0 - 1e-12  # keeps rounding on the allowed side
 
@@ -77,7 +79,8 @@ class Limiter:
     """Limits one stream of setpoints. Deterministic, with almost no allocation, never sleeps.
 
     For any input, the output of ``limit`` is finite, inside the envelope, within the joint limits,
-    and no step is larger than allowed.
+    and no step is larger than allowed. An offset beyond the envelope at the start never grows, and
+    comes inside within the rate limits.
     """
 
     def __init__(self, limits: Limits, n: int) -> None:
@@ -120,18 +123,31 @@ class Limiter:
         """Start a stream at the present command ``q`` (n,), rad.
 
         ``delta`` (n,), rad, and its TCP offset (6,) are the part of it that is a correction
-        already; default: none. Raises LimitError where they are not finite or outside the limits.
+        already; default: none. An offset left in the arm under a wider envelope is taken, because
+        only from where the arm is it ramps in without a jump. Raises LimitError where they are not
+        finite, the joints outside their limits, or the offset larger than any cell allows.
         """
         if not np.isfinite(q).all():
             raise LimitError(f"start: found {q}, expected finite joints")
         if (q < self.limits.lower).any() or (q > self.limits.upper).any():
             raise LimitError(f"start: found {q}, expected joints within their limits")
-        if delta is not None and not np.isfinite(delta).all():
-            raise LimitError(f"start: found an offset of {delta}, expected finite joints")
-        self._q[:] = q
-        self._delta[:] = 0.0 if delta is None else delta
+        delta = np.zeros(len(self._q)) if delta is None else delta
+        offset = np.zeros(6) if offset_in_base is None else offset_in_base
+        self._require_possible(delta, offset)
+        self._q[:], self._delta[:], self._offset[:] = q, delta, offset
         self._nominal[:] = self._reached[:] = q - self._delta
-        self._offset[:] = 0.0 if offset_in_base is None else offset_in_base
+
+    def _require_possible(self, delta: Array, offset_in_base: Array) -> None:
+        """Raise LimitError for an offset that is not finite, or larger than any cell allows."""
+        limits = self.limits
+        for what, size, most in (
+            ("joint offset", np.abs(delta).max(), max(MAX_JOINT_OFFSET, limits.joint_offset)),
+            ("TCP offset", np.linalg.norm(offset_in_base[:3]), max(MAX_OFFSET, limits.offset)),
+            ("TCP rotation", np.linalg.norm(offset_in_base[3:]),
+             max(MAX_OFFSET_ROTATION, limits.offset_rotation)),
+        ):  # fmt: skip
+            if not size <= most * (1.0 + 1e-9):  # nor where it is no number
+                raise LimitError(f"start: {what}: found {size:.4g}, expected at most {most:g}")
 
     def settle(self) -> None:
         """Take the nominal joints that the command has reached as the last nominal setpoint.

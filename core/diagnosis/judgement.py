@@ -241,7 +241,7 @@ def _insignificant(selection: Selection) -> dict[int, Withdrawal]:
         if c in straight:
             withdrawn[position] = Withdrawal(Check.CURVED)
         if candidate.curve is None and any(
-            _on_bound(p, v, candidate.effect.adds_up)
+            _on_bound(p, v, candidate.effect.adds_up or candidate.effect.adds_mass)
             for p, v in zip(candidate.parameters, term.values, strict=False)
         ):
             withdrawn[position] = Withdrawal(Check.INSIDE_BOUNDS)
@@ -255,13 +255,13 @@ def _insignificant(selection: Selection) -> dict[int, Withdrawal]:
     return withdrawn
 
 
-def _on_bound(parameter: Parameter, value: float, adds_up: bool) -> bool:
+def _on_bound(parameter: Parameter, value: float, may_be_gone: bool) -> bool:
     """Return whether a value is on a bound that tells nothing of it.
 
-    Of what adds up, a lower bound below zero is what the model holds: it is gone.
+    Of what adds up, as of a load, a lower bound below zero is what the model holds: it is gone.
     """
     below, above = abs(value - parameter.lower), abs(value - parameter.upper)
-    if adds_up and parameter.lower < 0:
+    if may_be_gone and parameter.lower < 0:
         below = np.inf
     return min(below, above) < 1e-6 * parameter.scale
 

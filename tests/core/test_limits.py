@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from gapbridge.core.errors import LimitError
-from gapbridge.core.limits import Limiter, Limits
+from gapbridge.core.limits import (
+    MAX_JOINT_OFFSET,
+    MAX_OFFSET,
+    MAX_OFFSET_ROTATION,
+    Limiter,
+    Limits,
+)
 from gapbridge.core.state import CLAMPS, ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, RATE, VELOCITY
 
 Array = NDArray[np.float64]
@@ -303,6 +309,60 @@ def test_without_a_start_nothing_leaves() -> None:
     assert not limiter.started
     with pytest.raises(LimitError):
         limiter.limit(np.zeros(N), np.zeros(N), np.zeros(6), 1.0, np.zeros(N), DT)
+
+
+@pytest.mark.parametrize(
+    ("delta", "offset"),
+    [
+        (None, np.full(6, np.nan)),
+        (None, np.array([np.inf, 0, 0, 0, 0, 0])),
+        (np.full(N, np.nan), None),
+        (np.full(N, 0.6), None),
+        (None, np.array([0.08, 0.08, 0, 0, 0, 0])),
+        (None, np.array([0, 0, 0, 0.4, 0.4, 0])),
+    ],
+)
+def test_no_stream_starts_with_an_offset_that_no_arm_can_have(delta, offset) -> None:
+    limiter = Limiter(limits(), N)
+    limiter.start(np.zeros(N))
+    before = limiter._state.copy()
+    with pytest.raises(LimitError, match="start: "):
+        limiter.start(np.full(N, 0.1), delta, offset)
+    np.testing.assert_array_equal(limiter._state, before)
+
+
+def test_the_largest_offsets_at_a_start_are_the_largest_that_cells_allow() -> None:
+    from gapbridge.bridge.cell.sections import LimitSettings
+    from gapbridge.drivers import gate
+
+    most = (MAX_OFFSET, MAX_OFFSET_ROTATION, MAX_JOINT_OFFSET)
+    names = ("offset", "offset_rotation", "joint_offset")
+    schema = LimitSettings.model_json_schema()["properties"]
+    assert tuple(schema[name]["maximum"] for name in names) == most
+    assert most[:2] == (gate.MAX_OFFSET, gate.MAX_OFFSET_ROTATION)
+
+
+@pytest.mark.parametrize("goal", [0.0, 1.0])
+def test_an_offset_left_under_a_wider_envelope_comes_inside_at_its_rate(goal: float) -> None:
+    """The first setpoint is where the arm is: neither refused, nor a jump into the envelope."""
+    left, nominal = np.array([0.03, 0.0, 0.0, 0.0, 0.05, 0.0]), np.full(N, 0.2)
+    delta = np.full(N, 0.08)
+    limiter = Limiter(limits(offset=0.01, offset_rotation=0.02, joint_offset=0.05), N)
+    limiter.start(nominal + delta, delta, left)
+    q, offset = nominal + delta, left
+    for _ in range(int(1.0 / DT)):
+        out = limiter.limit(nominal, nominal + delta, left, goal, q, DT)
+        step = out.offset_in_base - offset
+        assert np.linalg.norm(step[:3]) <= 0.05 * DT * TINY
+        assert np.linalg.norm(step[3:]) <= 0.1 * DT * TINY
+        assert np.linalg.norm(out.offset_in_base[:3]) <= np.linalg.norm(offset[:3]) * TINY
+        assert np.linalg.norm(out.offset_in_base[3:]) <= np.linalg.norm(offset[3:]) * TINY
+        assert np.abs(out.q - q).max() <= 1.5 * DT * TINY
+        q, offset = out.q.copy(), out.offset_in_base.copy()
+    assert np.linalg.norm(offset[:3]) <= 0.01 * TINY
+    assert np.linalg.norm(offset[3:]) <= 0.02 * TINY
+    assert np.abs(q - nominal).max() <= 0.05 * TINY
+    assert offset.any() == (goal > 0.0)
 
 
 @pytest.mark.parametrize("q", [np.full(N, np.nan), np.full(N, 2.5)])

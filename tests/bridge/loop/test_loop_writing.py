@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -498,6 +499,44 @@ def test_a_beginning_with_an_offset_in_force_makes_no_step(bench: Bench) -> None
     joints = np.array(bench.driver.sent)
     steps = np.linalg.norm(np.diff([tcp_of(q) for q in joints], axis=0), axis=1)
     assert steps.max() <= 0.05 * T * 1.01
+
+
+def test_an_offset_in_force_beyond_a_narrowed_envelope_ramps_in_and_is_not_refused(
+    bench: Bench,
+) -> None:
+    """Neither the limiter nor the gate makes the arm stay, or jump, because a cell was edited."""
+    bench.cycles(700)
+    left = float(np.linalg.norm(bench.stream.limiter.offset_in_base[:3]))
+    bench.supervisor.take(Cause.SILENCE)
+    bench.writing.release()
+    bench.q = bench.driver.sent[-1].copy()
+    narrow = left / 3
+    limiter, gate = bench.stream.limiter, bench.driver.gate
+    limiter._block[0] = narrow  # a reload makes another stream: the same limiter, narrower
+    gate.set_bounds(replace(gate.bounds, offset=narrow))
+    bench.rearm()
+    begin = len(bench.driver.sent)
+    bench.cycles(700)
+    joints = np.array(bench.driver.sent)[begin - 1 :]
+    assert len(joints) == 701
+    steps = np.linalg.norm(np.diff([tcp_of(q) for q in joints], axis=0), axis=1)
+    assert steps.max() <= 0.05 * T * 1.01
+    assert bench.supervisor.state == State.COMPENSATING
+    assert np.linalg.norm(limiter.offset_in_base[:3]) <= narrow * (1.0 + 1e-9)
+
+
+def test_an_offset_in_force_that_no_arm_can_have_is_refused(bench: Bench) -> None:
+    bench.cycles(10)
+    bench.supervisor.take(Cause.SILENCE)
+    bench.writing.release()
+    bench.writing._in_force.note(bench.q, np.full(6, 3.0), np.zeros(6))
+    bench.supervisor.state = State.ARMED
+    sent = len(bench.driver.sent)
+    for _ in range(2):
+        bench.writing.start(bench.state(), bench.q)
+    assert not bench.supervisor.state.writes
+    assert "joint offset: found 3, expected at most 0.5" in str(bench.changes[-1])
+    assert len(bench.driver.sent) == sent
 
 
 def test_an_arm_that_somebody_has_moved_begins_without_an_offset(bench: Bench) -> None:

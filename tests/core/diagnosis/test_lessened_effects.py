@@ -54,6 +54,18 @@ def test_play_that_is_less_or_gone_is_accused(held, left, seed):
     assert all(t.values[0] > 0 for t in kept)
 
 
+@pytest.mark.parametrize("seed", range(6))  # one of them on the bound
+def test_a_declared_load_that_is_not_there_is_accused(seed):
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(-2, 2, (60, 6))
+    measured = MODEL.predict(q).position + rng.normal(size=(60, 3)) * NOISE
+    columns = {"actual_q": q, "payload": np.full(60, 5.0), "measured_position": measured}
+    found = diagnose(MODEL, Log("log", columns, 6), Metrology(registered=True))
+    (cause,) = found.channels[0].causes
+    assert cause.effect == "payload"
+    assert cause.terms[0].values[0] == pytest.approx(-5.0, abs=0.1)
+
+
 def recording(truth, seed=0):
     """Return a recording of torques (and of encoders behind their commands)."""
     from gapbridge.core.dynamics import predict_torque, predict_tracking
