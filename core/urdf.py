@@ -167,9 +167,9 @@ def _assemble(
     bodies[-1] += _branches(path, root, np.eye(4), joints, links, on_chain)
     for joint in chain:
         kind, label = joint.get("type"), f"{path}: joint {joint.get('name')!r}"
-        step = fixed[-1] @ _origin(joint, label)
+        step = fixed[-1] @ origin_of(joint, label)
         if kind in REVOLUTE:
-            align = _align_z(_axis(joint, label))
+            align = _align_z(axis_of(joint, label))
             fixed[-1] = step @ align
             moving.append(joint)
             fixed.append(align.T)  # align is a pure rotation
@@ -198,13 +198,13 @@ def _arm(
         free = joint.get("type") == "continuous"
         for key, default in (("lower", -np.inf), ("upper", np.inf)):
             declared = limit is not None and not free and limit.get(key) is not None
-            columns[key].append(_vector(limit, key, "0", label)[0] if declared else default)
+            columns[key].append(numbers_of(limit, key, "0", label)[0] if declared else default)
         for key in ("velocity", "effort"):
             value = _not_negative(limit, key, label)
             columns[key].append(value if value > 0 else np.inf)
     limits = JointLimits(**{key: np.array(values) for key, values in columns.items()})
     names = tuple(str(j.get("name")) for j in moving)
-    axes = np.array([_align_z(_axis(joint, f"{path}: joint")).T[:3, :3] for joint in moving])
+    axes = np.array([_align_z(axis_of(joint, f"{path}: joint")).T[:3, :3] for joint in moving])
     return Arm(name, fixed, mass, cog, inertia, limits, joint_names=names, body_axes=axes)
 
 
@@ -224,7 +224,7 @@ def _branches(
         if _parent(joint) != link or child in on_chain:
             continue
         # movable side joints (a gripper's fingers) are taken at zero
-        child_frame = frame @ _origin(joint, f"{path}: joint {joint.get('name')!r}")
+        child_frame = frame @ origin_of(joint, f"{path}: joint {joint.get('name')!r}")
         body += _link(path, links[child], child_frame)
         body += _branches(path, child, child_frame, joints, links, on_chain)
     return body
@@ -237,15 +237,15 @@ def _link(path: Path, link: ElementTree.Element, frame: Array) -> _Body:
         return NO_BODY
     label = f"{path}: link {link.get('name')!r}"
     element = inertial.find("mass")
-    mass = _vector(element, "value", "0", label)[0]
-    pose = frame @ _origin(inertial, label)
+    mass = numbers_of(element, "value", "0", label)[0]
+    pose = frame @ origin_of(inertial, label)
     tensor = inertial.find("inertia")
     about_centre = np.zeros((3, 3))
     if tensor is not None:
         for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
             key = "i" + "xyz"[i] + "xyz"[j]
             number = _not_negative(tensor, key, label) if i == j else (
-                _vector(tensor, key, "0", label)[0]
+                numbers_of(tensor, key, "0", label)[0]
             )  # fmt: skip
             about_centre[i, j] = about_centre[j, i] = number
     R, c = pose[:3, :3], pose[:3, 3]
@@ -257,21 +257,27 @@ def _point(c: Array) -> Array:
     return np.asarray(c @ c * np.eye(3) - np.outer(c, c))
 
 
-def _axis(joint: ElementTree.Element, label: str) -> Array:
-    axis = _vector(joint.find("axis"), "xyz", "1 0 0", label)
+def axis_of(joint: ElementTree.Element, label: str) -> Array:
+    """Return a joint's axis (3,) as it stands; raises ArmError, its message after ``label``."""
+    axis = numbers_of(joint.find("axis"), "xyz", "1 0 0", label)
     if not 1e-6 <= math.hypot(*axis) <= 1e6:
         found = " ".join(f"{v:g}" for v in axis)
         raise ArmError(f"{label}: axis xyz: found {found!r}, expected a direction")
     return axis
 
 
-def _origin(element: ElementTree.Element, label: str) -> Array:
+def origin_of(element: ElementTree.Element, label: str) -> Array:
+    """Return the frame (4, 4) of an element's origin, m; raises ArmError as ``axis_of`` does."""
     origin = element.find("origin")
-    xyz = _vector(origin, "xyz", "0 0 0", label)
-    return transform(rpy_matrix(_vector(origin, "rpy", "0 0 0", label)), xyz)
+    xyz = numbers_of(origin, "xyz", "0 0 0", label)
+    return transform(rpy_matrix(numbers_of(origin, "rpy", "0 0 0", label)), xyz)
 
 
-def _vector(element: ElementTree.Element | None, key: str, default: str, label: str) -> Array:
+def numbers_of(element: ElementTree.Element | None, key: str, default: str, label: str) -> Array:
+    """Return the finite numbers of an attribute, as many as ``default`` has, which it may lack.
+
+    Raises ArmError as ``axis_of`` does.
+    """
     text = default if element is None else str(element.get(key, default))
     try:
         values = np.array([float(v) for v in text.split()])
@@ -286,7 +292,7 @@ def _vector(element: ElementTree.Element | None, key: str, default: str, label: 
 
 def _not_negative(element: ElementTree.Element | None, key: str, label: str) -> float:
     """Return a number of 0 or more; 0 where it is left out."""
-    value = float(_vector(element, key, "0", label)[0])
+    value = float(numbers_of(element, key, "0", label)[0])
     if value < 0.0:
         raise ArmError(f"{label}: {key}: found {value:g}, expected 0 or more")
     return value

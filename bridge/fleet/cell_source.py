@@ -26,6 +26,10 @@ class CellSource(ABC):
         """Return warnings to report before the run."""
         return ()
 
+    def inputs(self) -> tuple[Path, ...]:
+        """Return the table, and the cells that are known before the sessions are."""
+        return ()
+
 
 @dataclass(frozen=True)
 class OneCell(CellSource):
@@ -40,6 +44,10 @@ class OneCell(CellSource):
     def warnings(self) -> tuple[str, ...]:
         """Return the warnings of the cell; raises CellError if it cannot be used."""
         return load_cell(self.path).warnings
+
+    def inputs(self) -> tuple[Path, ...]:
+        """Return the cell."""
+        return (self.path,)
 
 
 @dataclass(frozen=True)
@@ -80,6 +88,10 @@ class CellTable(CellSource):
             raise CellError(
                 f"{session.log}: {self.path}: found no row for arm {session.arm!r}, expected one"
             ) from None
+
+    def inputs(self) -> tuple[Path, ...]:
+        """Return the table and all its cells."""
+        return (self.path, *self.cells.values())
 
 
 def cell_source(text: str, folder: Path) -> CellSource:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from gapbridge.bridge.fleet.session import (
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.bridge.report.labels import counted, effect_title, joint_list
 from gapbridge.core.calibration.spread import Spread
+from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.compliance_fit import flexibilities
 from gapbridge.core.fitted_range import merged
 
@@ -157,19 +159,36 @@ def write_cells(fit: FleetFit, folder: Path) -> list[Path]:
 
     Each is the cell of the arm's last session; flexibilities not identified are kept.
     """
-    written: list[tuple[str, Path]] = []
-    used: set[str] = set()
-    for kind in fit.types:
-        for arm in kind.arms:
-            path = folder / f"{_file_name(arm.name, used)}.yaml"
-            _write_cell(kind, arm, path)
-            written.append((arm.name, path))
+    arms = [(kind, arm) for kind in fit.types for arm in kind.arms]
+    paths = cell_paths(folder, [arm.name for _, arm in arms])
+    for (kind, arm), path in zip(arms, paths, strict=True):
+        _write_cell(kind, arm, path)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(("arm", "cell"))
-    table.writerows((arm, path.name) for arm, path in written)
+    table.writerows((arm.name, path.name) for (_, arm), path in zip(arms, paths, strict=True))
     write_text(folder / CELL_TABLE, text.getvalue())
-    return [*(path for _, path in written), folder / CELL_TABLE]
+    return [*paths, folder / CELL_TABLE]
+
+
+def cell_paths(folder: Path, arms: Sequence[str]) -> list[Path]:
+    """Return the path of each arm's new cell."""
+    used: set[str] = set()
+    return [folder / f"{_file_name(arm, used)}.yaml" for arm in arms]
+
+
+def require_no_input(folder: Path, arms: Sequence[str], inputs: Iterable[Path]) -> None:
+    """Raise InputError if a new cell, or the table of them, would replace an input.
+
+    A night without logs of some arms would else drop those from the table of the next.
+    """
+    known = {os.path.realpath(path): path for path in inputs}  # links are followed
+    for path in (folder / CELL_TABLE, *cell_paths(folder, arms)):
+        if (found := known.get(os.path.realpath(path))) is not None:
+            raise InputError(
+                f"{path}: found the output to be the input {found}, expected another folder for "
+                "--apply"
+            )
 
 
 def _write_cell(kind: FittedType, arm: FittedArm, path: Path) -> None:

@@ -6,15 +6,17 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.document.output_file import printable
+from gapbridge.bridge.document.provenance import installed_version
 from gapbridge.bridge.fleet.cell_source import CellSource
 from gapbridge.bridge.fleet.journal import Journal
 from gapbridge.bridge.fleet.session import Fleet, Session, natural_key
-from gapbridge.bridge.fleet.task import BAD, CRASHED, DIED, DONE, Outcome, SessionJob, Task
+from gapbridge.bridge.fleet.task import BAD, CRASHED, DIED, DONE, Outcome, SessionJob, Stamp, Task
 from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.bridge.report.labels import counted
 from gapbridge.core.errors import InputError
@@ -39,14 +41,18 @@ def make_tasks(
 ) -> tuple[list[Task], list[Outcome]]:
     """Return the tasks, and the outcomes of sessions without a usable cell or log."""
     tasks, bad = [], []
+    stamps: dict[Path, tuple[Stamp, ...]] = {}
+    version = installed_version()
     for session in sessions:
         task = Task("", session.arm, session.name, session.log, Path(), job, options)
         try:
             cell = cells.cell_of(session)
             for path in (session.log, cell):  # as the tables of results hold them
                 require_utf8(path)
-            key = _key(session, cell, job, options)
-            tasks.append(Task(key, session.arm, session.name, session.log, cell, job, options))
+            if cell not in stamps:
+                stamps[cell] = _cell_stamps(cell)
+            complete = replace(task, cell=cell, cell_stamps=stamps[cell])
+            tasks.append(replace(complete, key=_key(complete, version)))
         except InputError as error:
             bad.append(task.outcome(BAD, error=" ".join(printable(error).split())))
         except OSError as error:
@@ -84,16 +90,32 @@ def run(
     return FleetRun(tuple(ordered), resumed, time.perf_counter() - begin, workers.description())
 
 
-def _key(session: Session, cell: Path, job: SessionJob, options: Mapping[str, Any]) -> str:
-    """Return a hash of log, cell (path, size, time), job and options."""
-    stamps = [
-        (str(path.absolute()), (stat := path.stat()).st_size, stat.st_mtime_ns)
-        for path in (session.log, cell)
-        if path.exists()
-    ]
-    name = f"{job.__module__}:{job.__qualname__}"
-    parts = [JOURNAL_VERSION, name, session.arm, session.name, stamps, dict(options)]
+def _key(task: Task, version: str) -> str:
+    """Return a hash of log, cell with the files it names, job, options and Gapbridge's version."""
+    job = f"{task.job.__module__}:{task.job.__qualname__}"
+    parts = [
+        JOURNAL_VERSION, version, job, task.arm, task.session,
+        [*_stamps(task.log), *task.cell_stamps], dict(task.options),
+    ]  # fmt: skip
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def _cell_stamps(cell: Path) -> tuple[Stamp, ...]:
+    """Return the stamps of a cell and of the files that it names, such as its URDF."""
+    try:
+        named = [cell.parent / path for _, path in load_cell(cell).file.paths()]
+    except InputError:  # the worker reports it
+        named = []
+    return _stamps(cell, *(path for path in named if path.is_file()))  # a folder's time is its own
+
+
+def _stamps(*paths: Path) -> tuple[Stamp, ...]:
+    """Return path, size (bytes) and time of change (ns) of each file that exists."""
+    return tuple(
+        (str(path.absolute()), (stat := path.stat()).st_size, stat.st_mtime_ns)
+        for path in paths
+        if path.exists()
+    )
 
 
 def summary_lines(done: FleetRun, fleet: Fleet) -> list[str]:

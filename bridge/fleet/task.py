@@ -18,6 +18,7 @@ from gapbridge.core.errors import ArmError, CellError, GapbridgeError, LogError
 from gapbridge.core.log.log import Log
 
 SessionJob = Callable[[Cell, Log, Mapping[str, Any]], dict[str, Any]]
+Stamp = tuple[str, int, int]  # path, bytes, ns: another one, another content
 DONE, BAD, CRASHED, DIED = "done", "bad", "crashed", "died"
 MAX_DEATHS = 2  # workers that a session may kill in one run
 
@@ -33,6 +34,7 @@ class Task:
     cell: Path
     job: SessionJob
     options: Mapping[str, Any] = field(default_factory=dict)
+    cell_stamps: tuple[Stamp, ...] = ()  # of the cell and of the files that it names
 
     def outcome(self, state: str, seconds: float = 0.0, **rest: Any) -> Outcome:
         """Return an outcome of this task; ``rest`` are further fields of it.
@@ -85,9 +87,9 @@ def run_task(task: Task) -> Outcome:
 def _result(task: Task) -> tuple[str, dict[str, Any]]:
     """Return the state and the fields of the outcome that belong to it."""
     try:
-        cell = _cell(task.cell, task.cell.stat().st_mtime_ns) if task.cell.is_file() else (
-            load_cell(task.cell)
-        )  # fmt: skip
+        cell = _cell(task.cell, task.cell_stamps, task.cell.stat().st_mtime_ns) if (
+            task.cell.is_file()
+        ) else load_cell(task.cell)  # fmt: skip
         return DONE, {"result": task.job(cell, open_log(task.log, cell), task.options)}
     except (ArmError, CellError, LogError) as error:  # their messages name the file
         return BAD, {"error": _line(error)}
@@ -105,8 +107,8 @@ def _line(error: Exception) -> str:
 
 
 @functools.lru_cache(maxsize=64)
-def _cell(path: Path, changed: int) -> Cell:
-    """Return a cell, read once per process."""
+def _cell(path: Path, stamps: tuple[Stamp, ...], changed: int) -> Cell:
+    """Return a cell, read once per process and state of its files: a cluster's workers stay."""
     return load_cell(path)
 
 

@@ -36,6 +36,7 @@ from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import StartData, run_side
 from gapbridge.bridge.ipc.updated_settings import UpdatedSettings
+from gapbridge.bridge.recording.folder import segments
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import Guard
 from gapbridge.bridge.served.server import serve
@@ -302,7 +303,7 @@ class Families(Collector):
             "1 while nothing can be recorded (disk full, ...).",
             float(self._counts.recorder_paused),
         )
-        lag = _lag(self._counts.status.get("recording"), self._counts.clock.time())
+        lag = recording_lag(self._counts.status.get("recording"), self._counts.clock.time())
         if lag is not None:
             yield GaugeMetricFamily(
                 "gapbridge_recorder_lag_seconds",
@@ -335,16 +336,16 @@ def _numbers(part: Any) -> dict[str, float]:
     }
 
 
-def _lag(recording: Any, now: float) -> float | None:
-    """Return s until ``now`` since the newest file of a recording (its stem) changed.
+def recording_lag(recording: Any, now: float) -> float | None:
+    """Return s until ``now`` (s since 1970) since the newest file of a recording changed.
 
-    None without any.
+    ``recording``: its folder and run. None without any file of it.
     """
     if not recording:
         return None
     stem = Path(str(recording))
     try:
-        newest = max(p.stat().st_mtime for p in stem.parent.glob(f"{stem.name}-*.mcap"))
+        newest = max(p.stat().st_mtime for p in segments(stem.parent, stem.name))
     except (OSError, ValueError):
         return None
     return max(now - newest, 0.0)

@@ -2,7 +2,9 @@
 
 Parameters of causes are free within three standard deviations, all others are frozen. The effect of
 a parameter on the patched model is determined numerically: the model is also patched at both
-bounds, and each attribute is interpolated (a parabola through both bounds and the value).
+bounds, and each attribute is interpolated (a parabola through both bounds and the value). Where the
+parameter is a compliance, stiffnesses and gains are interpolated as what is linear in it, such as
+1 / stiffness.
 """
 
 from __future__ import annotations
@@ -24,6 +26,15 @@ from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.model import Model
 
 SIGMAS = 3.0  # from the value to each bound
+COMPLIANCES = ("rad/Nm", "1/(N m2)")  # units of parameters that a stiffness is the inverse of
+LEAST_SHARE = 0.1  # lower bound of a compliance per value: at 0 its spring is infinitely stiff
+# of attributes that a compliance changes: number ** -power is linear (of damping, quadratic) in it
+POWERS = {
+    "stiffness": (1.0, 1 / 2, 1 / 3),  # a polynomial in the angle
+    "damping": (2.0,),  # that of a spring
+    "gainprm": (1.0,),
+    "biasprm": (0.0, 1.0, 2.0),
+}
 MODELS = Mjcf.suffixes
 SUFFIXES = (".py", ".yaml", ".yml")
 ATTRIBUTES = {  # of a MjSpec's elements, that a patch can change
@@ -59,6 +70,7 @@ class _Parameter:
     bounds: Bounds
     terms: tuple[int, ...]  # indices into the model's terms; the last one is varied
     index: int  # in the term's values
+    compliance: bool
 
     def varied(self, model: Model, value: float) -> Model:
         """Return the model with another value."""
@@ -89,11 +101,11 @@ def parameters_text(path: Path, cell: Cell, options: PatchOptions, suffix: str) 
     for number in numbers:
         bounds = number.bounds
         if bounds.free:
-            at_bounds = [
+            lower, upper = (
                 _attributes(path, number.varied(cell.model, value), plain)
                 for value in (bounds.lower, bounds.upper)
-            ]
-            changes[bounds.name] = _between(at_value, *at_bounds)
+            )
+            changes[bounds.name] = list(_between(at_value, lower, upper, number.compliance))
     return _module(path, cell, numbers, changes)
 
 
@@ -112,8 +124,12 @@ def _numbers(cell: Cell) -> Iterator[_Parameter]:
             half_width = 0.0 if std is None else SIGMAS * std
             lower = max(value - half_width, parameter.lower)
             upper = min(value + half_width, parameter.upper)
-            free = half_width > 0 and lower < upper
-            yield _Parameter(Bounds(name, value, lower, upper, free), tuple(indices), k)
+            compliance = parameter.unit in COMPLIANCES
+            if compliance:
+                lower = max(lower, LEAST_SHARE * value)
+            free = half_width > 0 and lower < upper and not (compliance and value <= 0)
+            bounds = Bounds(name, value, lower, upper, free)
+            yield _Parameter(bounds, tuple(indices), k, compliance)
 
 
 def _sigmas(cell: Cell) -> dict[str, float]:
@@ -147,16 +163,30 @@ def _attributes(path: Path, model: Model, options: PatchOptions) -> dict[tuple[s
 
 def _between(
     middle: Mapping[tuple[str, ...], Array], lower: Mapping[tuple[str, ...], Array],
-    upper: Mapping[tuple[str, ...], Array],
-) -> list[list[Any]]:  # fmt: skip
-    """Return changes at the bounds: kind, name, attribute, change at lower, change at upper."""
-    changes = []
+    upper: Mapping[tuple[str, ...], Array], compliance: bool,
+) -> Iterator[list[Any]]:  # fmt: skip
+    """Yield the changed attributes: kind, name, attribute, powers, change at lower, at upper.
+
+    A power: that of the number's inverse whose changes are stated, 0 where it is the number itself.
+    """
     for key, value in middle.items():
         low, high = lower.get(key, value), upper.get(key, value)
-        if not (np.array_equal(low, value, True) and np.array_equal(high, value, True)):
-            steps = [np.nan_to_num(bound - value).tolist() for bound in (low, high)]
-            changes.append([*key, *steps])
-    return changes
+        if np.array_equal(low, value, True) and np.array_equal(high, value, True):
+            continue
+        powers = np.zeros(len(value))
+        if compliance:
+            known = np.array(POWERS.get(key[2], ()))[: len(value)]
+            powers[: len(known)] = known
+            powers[(low * value <= 0) | (high * value <= 0)] = 0.0
+        middle_number = _inverse(value, powers)
+        steps = [np.nan_to_num(_inverse(v, powers) - middle_number).tolist() for v in (low, high)]
+        yield [*key, powers.tolist(), *steps]
+
+
+def _inverse(numbers: Array, powers: Array) -> Array:
+    """Return the sizes of numbers to their negative powers; as they are where a power is 0."""
+    sizes = np.where(powers > 0, np.abs(numbers), 1.0)
+    return np.where(powers > 0, sizes**-powers, numbers)
 
 
 def _module(
@@ -189,9 +219,16 @@ import numpy as np
 BOUNDS = {{  # value, lower, upper, free
 {bounds}
 }}
-CHANGES = {{  # kind, name, attribute of the patched model; by how much at lower, at upper
+CHANGES = {{  # kind, name, attribute of the patched model; powers; by how much at lower, at upper
 {changes}
 }}
+
+
+def shifted(number, change, power):
+    """Return a number that changes, or whose inverse to a power changes, as a stiffness does."""
+    if not power:
+        return number + change
+    return np.copysign((abs(number) ** -power + change) ** (-1 / power), number)
 
 
 def modifier(name):
@@ -201,7 +238,7 @@ def modifier(name):
 
     def modify(spec, parameter):
         x = float(np.ravel(parameter.value)[0]) - value
-        for kind, element, attribute, low, high in CHANGES.get(name, ()):
+        for kind, element, attribute, powers, low, high in CHANGES.get(name, ()):
             target = getattr(spec, kind) if kind == "option" else getattr(spec, kind)(element)
             change = np.zeros(len(low))  # a parabola through 0 at x = 0, low at a, high at b
             if a:
@@ -211,10 +248,10 @@ def modifier(name):
             nominal = getattr(target, attribute)
             if attribute == "nsample":
                 setattr(target, attribute, int(nominal + max(0, *low, *high)))
-            elif np.ndim(nominal) == 0:
-                setattr(target, attribute, float(nominal) + float(change[0]))
-            else:
-                setattr(target, attribute, np.array(nominal) + change)
+                continue
+            moved = np.array([shifted(*number) for number in zip(
+                np.ravel(nominal).astype(float), change, powers, strict=True)])
+            setattr(target, attribute, float(moved[0]) if np.ndim(nominal) == 0 else moved)
 
     return modify
 

@@ -18,9 +18,9 @@ from gapbridge.bridge.patch.model_format import (
 )
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects.simulator import Kind
-from gapbridge.core.errors import InputError
-from gapbridge.core.rotation import roll_pitch_yaw, rpy_matrix, transform
-from gapbridge.core.urdf import checked_urdf
+from gapbridge.core.errors import ArmError, InputError
+from gapbridge.core.rotation import roll_pitch_yaw
+from gapbridge.core.urdf import axis_of, checked_urdf, numbers_of, origin_of
 
 REVOLUTE = ("revolute", "continuous")
 INSTEAD = {
@@ -67,6 +67,7 @@ class _Document:
     """A URDF as text, whose attributes are rewritten in place."""
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         try:
             self.text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
@@ -83,10 +84,11 @@ class _Document:
         return "" if element is None else str(element.get("link"))
 
     def origin(self, joint: str) -> Array:
-        element = self.joints[joint].find("origin")
-        pose = {} if element is None else element.attrib
-        xyz, rpy = (np.array(pose.get(k, "0 0 0").split(), dtype=float) for k in ("xyz", "rpy"))
-        return transform(rpy_matrix(rpy), xyz)
+        return origin_of(self.joints[joint], self.label(joint))
+
+    def label(self, name: str, kind: str = "joint") -> str:
+        """Return what messages call a joint or link."""
+        return f"{self.path}: {kind} {name!r}"
 
     def child_frames(self) -> dict[str, Array]:
         """Return the frames (4, 4) of all links in the root link's, joints at zero."""
@@ -108,9 +110,8 @@ class _Document:
     def axes(self, names: Sequence[str], frames: dict[str, Array]) -> Axes:
         point, direction = [], []
         for name in names:
-            frame, element = frames[self.end(name, "child")], self.joints[name].find("axis")
-            axis = np.array(("1 0 0" if element is None else element.get("xyz", "1 0 0")).split(),
-                            dtype=float)  # fmt: skip
+            frame = frames[self.end(name, "child")]
+            axis = axis_of(self.joints[name], self.label(name))
             point.append(frame[:3, 3])
             direction.append(frame[:3, :3] @ axis / np.linalg.norm(axis))
         return Axes(np.array(point), np.array(direction))
@@ -176,12 +177,11 @@ def _without_comments(text: str) -> str:
 
 def _dynamics(document: _Document, name: str, joint: int, changes: ModelChanges) -> list[str]:
     element = document.joints[name].find("dynamics")
-    attributes = {} if element is None else element.attrib
     values: dict[str, Array | float] = {}
     for kind, key in ((Kind.FRICTION, "friction"), (Kind.DAMPING, "damping")):
         added = changes.of_joint(kind, joint)
         if added:
-            values[key] = float(attributes.get(key, 0)) + added
+            values[key] = float(numbers_of(element, key, "0", document.label(name))[0]) + added
     if values:
         document.write("joint", name, "dynamics", values)
     return [f"joint {name}: {key} {value:.6g}" for key, value in values.items()]
@@ -200,8 +200,9 @@ def _inertials(document: _Document, names: Sequence[str], changes: ModelChanges)
             element = inertial.find(tag)
             attributes = {} if element is None else element.attrib
             values: dict[str, Array | float] = {
-                key: float(attributes[key]) * factor for key in keys if key in attributes
-            }
+                key: numbers_of(element, key, "0", document.label(link, "link")) * factor
+                for key in keys if key in attributes
+            }  # fmt: skip
             if values:
                 document.write("link", link, tag, values)
         lines.append(f"link {link}: mass and inertia times {factor:.6g}")
@@ -221,11 +222,12 @@ def _centres(
         if inertial is None or mass is None or not moment.any():
             continue
         in_link = frames[link][:3, :3].T @ (world @ changes.joint_in_base[i])[:3, :3] @ moment
-        element = inertial.find("origin")
-        xyz = "0 0 0" if element is None else element.get("xyz", "0 0 0")
-        scale = 1 + changes.of_joint(Kind.LINK_SCALE, i + 1)
-        shift = in_link / (float(mass.get("value", 1)) * scale)
-        centre = np.array(xyz.split(), dtype=float) + shift
+        label = document.label(link, "link")
+        old = numbers_of(inertial.find("origin"), "xyz", "0 0 0", label)
+        (size,) = numbers_of(mass, "value", "0", label)
+        if size <= 0:
+            raise ArmError(f"{label}: mass value: found {size:g}, expected more than 0")
+        centre = old + in_link / (size * (1 + changes.of_joint(Kind.LINK_SCALE, i + 1)))
         document.write("link", link, "origin", {"xyz": centre}, inside="inertial")
         lines.append(f"link {link}: centre of gravity")
     return lines

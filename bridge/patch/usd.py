@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +54,7 @@ class Usd(ModelFormat):
               notes: Sequence[str]) -> Patched:  # fmt: skip
         """Return a layer (.usda) with the model as its sublayer and the changes as overs."""
         stage = _Stage(path, options.folder)
-        names = pick_joints(path, list(stage.joints), changes, options)
+        names = stage.pick_joints(changes, options)
         world = base_in_world(changes.axes(), stage.axes(names), str(path), names)
         layer = _Layer(stage, changes, options, world, names)
         for joint, name in enumerate(names, start=1):
@@ -99,12 +100,34 @@ class _Stage:
         self.folder = folder or path.parent
         self.unit = UsdGeom.GetStageMetersPerUnit(source)
         self.kilogram = UsdPhysics.GetStageKilogramsPerUnit(source)
-        self.joints: dict[str, Any] = {}
+        self.paths: dict[str, list[str]] = {}  # of the joints of a name: of several robots
         for prim in self.stage.Traverse():
             if prim.IsA(UsdPhysics.RevoluteJoint):
-                self.joints[prim.GetName()] = UsdPhysics.RevoluteJoint(prim)
+                self.paths.setdefault(prim.GetName(), []).append(str(prim.GetPath()))
+        self.joints: dict[str, Any] = {  # by name, or by path where several have the name
+            name if len(paths) == 1 else path: UsdPhysics.RevoluteJoint.Get(self.stage, path)
+            for name, paths in self.paths.items()
+            for path in paths
+        }
         self._carried = {name: self.body(joint, 1) for name, joint in self.joints.items()}
         self.frames = self._at_zero()
+
+    def pick_joints(self, changes: ModelChanges, options: PatchOptions) -> tuple[str, ...]:
+        """Return the arm's joints, as in ``joints``; the user's may be names or prim paths.
+
+        Raises InputError where they cannot be assigned, or several joints have the name of one.
+        """
+        name_of = {str(joint.GetPath()): name for name, joint in self.joints.items()}
+        chosen = tuple(name_of.get(given, given) for given in options.joints)
+        known = list(dict.fromkeys([*self.paths, *self.joints] if chosen else self.paths))
+        names = pick_joints(self.path, known, changes, replace(options, joints=chosen))
+        for name in names:
+            if name not in self.joints:
+                raise InputError(
+                    f"{self.path}: joints: found {name} as {' and '.join(self.paths[name])}, "
+                    "expected one of them; name the arm's joints by their paths with --joints"
+                )
+        return names
 
     def _at_zero(self) -> dict[str, Array]:
         """Return the poses (4, 4) of bodies at zero angles, joint by joint from the roots."""
@@ -358,7 +381,7 @@ class _Layer:
     ) -> None:
         stage, joint = self.stage, self.stage.joints[name]
         child = stage.body(joint, 1)
-        path = f"{joint.GetPath().GetParentPath()}/{name}_{label}"
+        path = f"{joint.GetPath()}_{label}"
         body = stage.UsdGeom.Xform.Define(stage.stage, f"{path}_body")
         stage.UsdPhysics.RigidBodyAPI.Apply(body.GetPrim())
         mass = stage.UsdPhysics.MassAPI.Apply(body.GetPrim())
@@ -401,11 +424,17 @@ class _Layer:
     def tool(self) -> None:
         """Move the Xform of the TCP, given by path or name."""
         stage = self.stage.stage
-        paths = {p.GetName(): str(p.GetPath()) for p in stage.Traverse()
-                 if p.IsA(self.stage.UsdGeom.Xformable)}  # fmt: skip
+        prims = [p for p in stage.Traverse() if p.IsA(self.stage.UsdGeom.Xformable)]
         tcp = self.options.tcp
-        if tcp and tcp not in paths.values():
-            tcp = paths[known_name(self.stage.path, "--tcp", tcp, list(paths))]
+        if tcp and tcp not in [str(p.GetPath()) for p in prims]:
+            known_name(self.stage.path, "--tcp", tcp, [p.GetName() for p in prims])
+            paths = [str(p.GetPath()) for p in prims if p.GetName() == tcp]
+            if len(paths) > 1:
+                raise InputError(
+                    f"{self.stage.path}: --tcp: found {tcp} as {' and '.join(paths)}, expected the "
+                    "path of one"
+                )
+            tcp = paths[0]
         if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TOLERANCE):
             return
         if not tcp:

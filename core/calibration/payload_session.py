@@ -62,8 +62,9 @@ def weight_columns(model: Model, q: Array) -> Array:
     At the model's deflected flange; misalignment and gain of the sensor in the model are applied.
     """
     poses = model.predict(q)
-    flange_rotation = poses.rotation @ model.chain().tool_rotation.T
-    down = np.swapaxes(flange_rotation, 1, 2) @ model.gravity
+    chain = model.chain()  # its gravity is the true one, turned by the model's effects
+    flange_rotation = poses.rotation @ chain.tool_rotation.T
+    down = np.swapaxes(flange_rotation, 1, 2) @ chain.gravity
     columns = np.zeros((len(q), 6, 10))
     columns[:, :3, 0] = down
     for k in range(3):

@@ -186,6 +186,7 @@ class TcpForce:
         self._model = model
         self._tool = np.array(model.tool_in_flange, dtype=float)
         self._undo, self._bias = _sensor_correction(model)
+        self._gravity = model.chain().gravity  # the true one, turned by the model's effects
         # prepared once: Model.predict would do it in every cycle
         rigid = model.without_terms()
         self._chain, self._rows = rigid.chain(), rigid.rows(np.zeros((1, model.arm.n)))
@@ -208,7 +209,7 @@ class TcpForce:
         model.condition(rows, self._no_loads, rows.q, self._undeclared)
         mass, cog = rows.payload_mass[0], rows.payload_cog[0]
         flange_in_base = self._flange_in_base()
-        weight = flange_in_base.T @ (mass * model.gravity)
+        weight = flange_in_base.T @ (mass * self._gravity)
         wrench = self._undo @ (wrench_in_flange - self._bias)
         force = wrench[:3] - weight
         torque = wrench[3:] - _cross(cog, weight) - _cross(self._tool[:3, 3], force)

@@ -20,7 +20,10 @@ from gapbridge.core.errors import InputError
 @click.argument("model", type=FILE)
 @cell_option
 @click.option("--out", required=True, type=FILE, help="The patched model to write.")
-@click.option("--joints", metavar="A,B,...", help="The model's joints, in the order of the arm's.")
+@click.option(
+    "--joints", metavar="A,B,...",
+    help="The model's joints, in the order of the arm's; in a USD also prim paths.",
+)  # fmt: skip
 @click.option(
     "--tcp", metavar="NAME", help="The model's TCP: a site (MJCF), link (URDF) or Xform (USD)."
 )

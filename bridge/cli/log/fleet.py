@@ -155,6 +155,11 @@ def _run(
     for file in (RESULTS_FILE, SESSIONS_FILE, REPORT_FILE):
         require_writable(options.out / file)
     tasks, bad = make_tasks(sessions.sessions, cells, job, job_options)
+    if options.cells is not None:
+        from gapbridge.bridge.fleet.output import require_no_input
+
+        inputs = (*cells.inputs(), *(task.cell for task in tasks))
+        require_no_input(options.cells, [task.arm for task in tasks], inputs)
     count = min(workers or os.cpu_count() or 1, max(len(tasks), 1))
     pool: Workers = DaskWorkers(scheduler) if scheduler else LocalWorkers(count)
     for outcome in bad:

@@ -247,3 +247,44 @@ def test_the_tables_of_a_run_are_no_sessions_of_it(tmp_path: Path) -> None:
     line = refused("fleet", "fit", tmp_path, "--cell", tmp_path / "arms.csv", "--apply", new_cells,
                    "--out", tmp_path / "out")  # fmt: skip
     assert "found only tables of a run, expected logs" in line
+
+
+def two_cells_in(folder: Path) -> Path:
+    """Write a table of the cells of arms A and B, and return it."""
+    cells = folder / "cells"
+    cells.mkdir()
+    for arm in "AB":
+        cell_in(cells).rename(cells / f"{arm}.yaml")
+    table = cells / "cells.csv"
+    table.write_text("arm,cell\nA,A.yaml\nB,B.yaml\n")
+    return table
+
+
+@pytest.mark.parametrize("given", ["table", "table elsewhere", "cell", "link"])
+def test_no_input_cell_is_replaced_by_a_new_one(tmp_path: Path, given: str) -> None:
+    table = two_cells_in(tmp_path)
+    cells = table.parent
+    logs, cell, new = logs_in(tmp_path, ["A/s0"]), table, cells
+    if given == "table elsewhere":
+        cell = tmp_path / "arms.csv"
+        cell.write_text("arm,cell\nA,cells/A.yaml\n")
+    elif given == "cell":
+        cell = cells / "A.yaml"
+    elif given == "link":
+        new = tmp_path / "new"
+        new.symlink_to(cells)
+    before = {path.name: path.read_bytes() for path in cells.iterdir()}
+    line = refused("fleet", "fit", logs, "--cell", cell, "--apply", new,
+                   "--out", tmp_path / "out")  # fmt: skip
+    assert "expected another folder for --apply" in line
+    assert {path.name: path.read_bytes() for path in cells.iterdir()} == before
+
+
+def test_no_cell_beside_a_log_is_replaced_by_a_new_one(tmp_path: Path) -> None:
+    logs = logs_in(tmp_path, ["A"])
+    cell = cell_in(tmp_path).rename(logs / "A.yaml")
+    before = cell.read_bytes()
+    line = refused("fleet", "fit", logs, "--cell", "beside", "--apply", logs,
+                   "--out", tmp_path / "out")  # fmt: skip
+    assert "expected another folder for --apply" in line
+    assert cell.read_bytes() == before

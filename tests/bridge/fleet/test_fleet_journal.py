@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from benchmarks.patch.arms import UR_JOINTS, urdf
+from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.fleet.cell_source import OneCell
 from gapbridge.bridge.fleet.journal import Journal
 from gapbridge.bridge.fleet.runner import make_tasks, run
 from gapbridge.bridge.fleet.session import find_sessions
 from gapbridge.bridge.fleet.task import BAD, DIED, DONE, Outcome, Task, run_task
 from gapbridge.bridge.fleet.workers.workers import Workers
+from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import RunError
+from gapbridge.core.log.log import Log
 from gapbridge.drivers.clock import SYSTEM
-from tests.bridge.fleet.fleet_in import tasks_in
+from tests.bridge.fleet.fleet_in import logs_in, tasks_in
 from tests.bridge.fleet.jobs import count_rows
 
 
@@ -119,3 +127,46 @@ def test_a_run_goes_on_where_it_was_broken_off_and_redoes_what_has_changed(tmp_p
         sessions, OneCell(tmp_path / "cell.yaml"), count_rows, {"withhold": ["x"]}
     )
     assert {t.key for t in other}.isdisjoint({t.key for t in again})
+
+
+def flange_height(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the height of the flange at zero angles of the arm that a worker has read, m."""
+    return {"height": float(np.linalg.multi_dot(cell.arm.link_in_link)[2, 3])}
+
+
+@pytest.mark.parametrize("kind", ["urdf", "calibration"])
+def test_a_file_that_the_cell_names_is_part_of_the_cell(tmp_path: Path, kind: str) -> None:
+    arm = builtin_arm("ur10e")
+    taller = arm.link_in_link.copy()
+    taller[0, 2, 3] += 0.01
+    if kind == "urdf":
+        robot = "{urdf: file}"
+        states = [urdf(a, UR_JOINTS) for a in (arm, replace(arm, link_in_link=taller))]
+    else:
+        robot = "{model: ur10e, calibration: file}"
+        states = [f"[mounting]\ndelta_d = [{d}, 0, 0, 0, 0, 0]\n" for d in (0.0, 0.01)]
+    cell, sessions = tmp_path / "cell.yaml", find_sessions([str(logs_in(tmp_path, ["a/s"]))])
+    cell.write_text(f"robot: {robot}\n")
+    path, runs = tmp_path / "j.jsonl", []
+    for k, text in enumerate((states[0], None, states[1])):
+        if text is not None:
+            (tmp_path / "file").write_text(text)
+            os.utime(tmp_path / "file", ns=(k, k))
+        tasks, bad = make_tasks(sessions.sessions, OneCell(cell), flange_height, {})
+        assert not bad
+        runs.append(resumed(tasks, path))
+    assert runs == [["a/s"], [], ["a/s"]]
+    before, after = (json.loads(line) for line in path.read_text().splitlines())
+    assert after["result"]["height"] - before["result"]["height"] == pytest.approx(0.01)
+
+
+def test_another_version_of_gapbridge_computes_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = tasks_in(tmp_path, ["a/s1"], count_rows)
+    monkeypatch.setattr("gapbridge.bridge.fleet.runner.installed_version", lambda: "99.0")
+    new, _ = make_tasks(
+        find_sessions([str(tmp_path / "logs")]).sessions,
+        OneCell(tmp_path / "cell.yaml"), count_rows, {},
+    )  # fmt: skip
+    assert old[0].key != new[0].key

@@ -15,7 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from watched_feed import Feed
 
 from gapbridge.bridge.ipc.loop_state import State
-from gapbridge.bridge.metrics.main import Buckets
+from gapbridge.bridge.metrics.main import Buckets, recording_lag
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +135,18 @@ def test_a_cell_that_was_read_again_gives_its_limits(feed):
     feed.change(State.OBSERVING, "afterwards")
     wait_for(lambda: "afterwards" in feed.wait("metrics").text, "the event after it")
     assert value(families(feed), "gapbridge_offset_limit_meters") == 0.004
+
+
+def test_the_recording_is_late_although_another_run_of_the_same_second_is_written(tmp_path):
+    run = tmp_path / "run-20260102-030405"
+    for name, changed in (("-001", 100.0), ("-1000", 300.0), ("-999", 200.0), ("-2-001", 900.0)):
+        path = tmp_path / f"{run.name}{name}.mcap"
+        path.touch()
+        os.utime(path, (changed, changed))
+    assert recording_lag(str(run), 1000.0) == 700.0
+    assert recording_lag(f"{run}-2", 1000.0) == 100.0
+    assert recording_lag(f"{run}-3", 1000.0) is None
+    assert recording_lag(None, 1000.0) is None
 
 
 def test_nothing_else_is_served(feed):

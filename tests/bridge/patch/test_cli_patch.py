@@ -150,6 +150,41 @@ def test_modifiers_bring_the_patched_model_to_any_value_within_bounds(folder: Pa
     assert late.actuator_delay[drive] == pytest.approx(0.023)
 
 
+def test_a_spring_is_the_inverse_of_its_compliance_within_wide_bounds(folder: Path) -> None:
+    wide = CELL.replace("std: 1.0e-6, unit: rad/Nm", "std: 8.0e-6, unit: rad/Nm")
+    droop = "  - {effect: servo_droop, joint: 3, parameters: {value: 5.0e-5}}\nprovenance:"
+    cause = (
+        "    - {effect: servo_droop, joints: [3], channel: tracking, parameters: "
+        "[{name: servo_droop_3, value: 5.0e-5, std: 1.0e-5, unit: rad/Nm}]}\n"
+    )
+    wide = wide.replace("provenance:", droop) + cause
+    (folder / "cell.yaml").write_text(wide)
+    done = patch(folder, "arm.xml", "--out", "out.xml", "--parameters", "bounds.py")
+    assert done.code == 0, done.err
+    module = loaded(folder / "bounds.py")
+    assert module.BOUNDS["axial_compliance_2"][:3] == pytest.approx((2e-5, 2e-6, 4.4e-5))
+
+    for name, given, attributes in (
+        ("axial_compliance_2", "axial: [0, 2.0e-5", ("jnt_stiffness", "dof_damping")),
+        ("servo_droop_3", "servo_droop, joint: 3, parameters: {value: 5.0e-5",
+         ("actuator_gainprm", "actuator_biasprm")),
+    ):  # fmt: skip
+        _, lower, upper, free = module.BOUNDS[name]
+        assert free
+        for x in np.linspace(lower, upper, 7).tolist():
+            spec = mujoco.MjSpec.from_file(str(folder / "out.xml"))
+            module.modifier(name)(spec, Number(x))
+            found = spec.compile()
+            assert given in wide
+            (folder / "cell.yaml").write_text(wide.replace(given, given[:-6] + f"{x:.17f}"))
+            assert patch(folder, "arm.xml", "--out", "other.xml").code == 0
+            wanted = mujoco.MjModel.from_xml_path(str(folder / "other.xml"))
+            for attribute in attributes:
+                assert np.allclose(
+                    getattr(found, attribute), getattr(wanted, attribute), rtol=1e-3
+                ), (attribute, x)
+
+
 def test_mujocos_own_sysid_reads_the_bounds(folder: Path) -> None:
     sysid = pytest.importorskip("mujoco.sysid")
     if not hasattr(sysid, "ParameterDict"):

@@ -200,3 +200,65 @@ def test_what_is_no_usd_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture
         )
     assert "\n" not in str(error.value)
     assert capfd.readouterr().err == ""  # USD itself warns
+
+
+def two_robots_in(folder: Path) -> Path:
+    """Write a stage that has the arm twice, as /left and as /right, and return it."""
+    write_stage(folder / "one.usda", ARM, 1.0, nested=False)
+    path = folder / "two.usda"
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    for name, y in (("left", 0.0), ("right", 3.0)):
+        robot = UsdGeom.Xform.Define(stage, f"/{name}")
+        robot.GetPrim().GetReferences().AddReference("./one.usda")
+        robot.AddTranslateOp().Set((0, y, 0))
+    stage.Save()
+    return path
+
+
+@pytest.mark.parametrize("joints", [(), UR_JOINTS])
+def test_joints_of_two_robots_are_refused_with_their_paths(
+    tmp_path: Path, joints: tuple[str, ...]
+) -> None:
+    path = two_robots_in(tmp_path)
+    with pytest.raises(InputError, match="with --joints") as error:
+        format_of(path).patch(path, changes_of(NOMINAL), PatchOptions(joints), [])
+    assert f"found {UR_JOINTS[0]} as /left/{UR_JOINTS[0]} and /right/{UR_JOINTS[0]}" in str(
+        error.value
+    )
+
+
+def test_one_of_two_robots_is_patched_by_its_joints_paths(tmp_path: Path) -> None:
+    path, out = two_robots_in(tmp_path), tmp_path / "out.usda"
+    terms = (Term("joint_offset", Site(3), (0.004,)), Term("axial_compliance", Site(2), (2e-5,)))
+    options = PatchOptions(tuple(f"/left/{name}" for name in UR_JOINTS))
+    done = format_of(path).patch(path, changes_of(NOMINAL.with_terms(terms)), options, [])
+    out.write_text(done.text)
+    before, after = Usd.Stage.Open(str(path)), Usd.Stage.Open(str(out))
+    spring = after.GetPrimAtPath(f"/left/{UR_JOINTS[1]}_axial_compliance")
+    assert spring.IsA(UsdPhysics.RevoluteJoint)
+    for robot, changed in (("left", True), ("right", False)):
+        elbow = f"/{robot}/{UR_JOINTS[2]}"
+        old, new = (
+            UsdPhysics.Joint.Get(stage, elbow).GetLocalRot0Attr().Get() for stage in (before, after)
+        )
+        assert (old != new) == changed
+
+
+def test_a_tcp_of_two_robots_is_refused_with_its_paths(tmp_path: Path) -> None:
+    path = two_robots_in(tmp_path)
+    options = PatchOptions(tuple(f"/left/{name}" for name in UR_JOINTS), tcp="tcp")
+    with pytest.raises(InputError, match=r"--tcp: found tcp as /left/\S*tcp and /right/\S*tcp,"):
+        format_of(path).patch(path, changes_of(NOMINAL), options, [])
+
+
+def test_a_path_names_a_joint_whose_name_is_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "arm.usda"
+    write_stage(path, ARM, 1.0, nested=False)
+    changes = changes_of(NOMINAL.with_terms((Term("joint_offset", Site(3), (0.004,)),)))
+    paths = PatchOptions(tuple(f"/arm/{name}" for name in UR_JOINTS))
+    texts = {
+        format_of(path).patch(path, changes, options, []).text
+        for options in (PatchOptions(), paths)
+    }
+    assert len(texts) == 1

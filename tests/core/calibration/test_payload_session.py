@@ -12,6 +12,7 @@ from benchmarks.blind.arms import ARMS
 from benchmarks.blind.mechanics import stand
 from benchmarks.calibration.drawings import model_of, real_arm, session_at
 from gapbridge.core.calibration.payload_session import calibrate_payload
+from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
@@ -23,12 +24,14 @@ BEGIN = np.array([0.0, -1.5, 1.5, -1.5, -1.5, 0.0])
 FORCE, TORQUE = 0.1, 0.005  # N, Nm
 
 
-def _readings(q: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def _readings(
+    q: Array, rng: np.random.Generator, gravity: tuple[float, ...] = (0.0, 0.0, -9.80665)
+) -> tuple[Array, Array]:
     """Return what a sensor reads (N, 6), and the truth (10,): mass, cog, bias."""
     mass, cog = rng.uniform(1, 8), 0.05 * rng.normal(size=3)
     bias = np.concatenate([3 * rng.normal(size=3), 0.2 * rng.normal(size=3)])
     shape = stand(real_arm(KIND), session_at(q, mass, cog))
-    weight = mass * np.array([0, 0, -9.80665])
+    weight = mass * np.array(gravity)
     force = np.einsum("nji,j->ni", shape.flange_rotation, weight)
     noise = rng.normal(size=(len(q), 6)) * np.repeat([FORCE, TORQUE], 3)
     return np.hstack([force, np.cross(cog, force)]) + bias + noise, np.array([mass, *cog, *bias])
@@ -86,6 +89,19 @@ def test_a_sensor_known_to_be_turned_is_read_as_it_stands(model: Model) -> None:
     knowing = model.with_terms([Term("ft_misalignment", Site(), (0.0, 0.0, np.pi / 2))])
     found = calibrate_payload(knowing, q, sensed)
     assert found.cog == pytest.approx(truth[1:4], abs=1e-3)
+
+
+def test_a_base_that_is_known_not_to_be_level_turns_the_weight(model: Model) -> None:
+    rng = np.random.default_rng(4)
+    q = rng.uniform(KIND.low, KIND.high, (12, 6))
+    tilt = 0.05  # rad about x of base
+    gravity = (0.0, 9.80665 * np.sin(tilt), -9.80665 * np.cos(tilt))
+    wrench, truth = _readings(q, rng, gravity)
+    turned = model.with_terms([*model.terms, Term("gravity_direction", Site(), (tilt, 0.0))])
+    found = calibrate_payload(turned, q, wrench)
+    assert found.noise[0] < 2 * FORCE
+    for estimate, value in zip(found.estimates, truth, strict=True):
+        assert abs(estimate.value - value) < 5 * estimate.std
 
 
 def test_orientations_that_hardly_turn_are_refused(model: Model) -> None:

@@ -37,7 +37,7 @@ from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor import joined as joined_module
-from gapbridge.drivers.ft_sensor.joined import LISTEN, DriverWithSensor
+from gapbridge.drivers.ft_sensor.joined import LISTEN, DriverWithSensor, TcpForce
 from gapbridge.drivers.ft_sensor.sensor import ClockOffset, ForceTorqueSensor, Reading
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
@@ -204,6 +204,17 @@ def test_a_load_in_the_effects_weighs_on_the_sensor_and_is_no_external_force() -
     with wire.device, joined(wire, controller, undeclared) as driver:
         for _ in range(3):  # each cycle begins with what is declared
             assert np.all(np.abs(driver.read_state().actual_TCP_force) <= bounds("robotous_rft"))
+
+
+def test_gravity_that_the_effects_turn_is_no_external_force() -> None:
+    tilt = 0.05  # rad about x of base
+    turned = model(terms=(Term("gravity_direction", Site(), (tilt, 0.0)),))
+    gravity = 9.80665 * np.array((0.0, np.sin(tilt), -np.cos(tilt)))
+    weight = MASS * flange_rotation(TURNED).T @ gravity
+    reading = np.concatenate([weight, np.cross(COG, weight)])
+    q = np.array(TURNED)
+    state = RobotState(1.0, 0.0, q, np.zeros(6), q, np.zeros(6))
+    assert TcpForce(turned).of(reading, state) == pytest.approx(np.zeros(6), abs=1e-9)
 
 
 def test_an_arm_may_keep_its_own_tcp_force() -> None:
