@@ -171,8 +171,9 @@ class _Patch:
 
     def springs(self, name: str, joint: int) -> None:
         """Add play and springs after a joint: about its axis, then across it."""
-        axes = self.joint_in_world(joint)[:3, :3]
-        self._play(name, joint, axes[:, 2])
+        frame = self.joint_in_world(joint)
+        origin, axes = frame[:3, 3], frame[:3, :3]
+        self._play(name, joint, frame)
         flexibility = self.changes.springs.joint[joint - 1]
         softening = self.changes.springs.softening[joint - 1]
         for k, label in ((2, "axial_compliance"), (0, "radial_x"), (1, "radial_y")):
@@ -184,12 +185,16 @@ class _Patch:
                 stiffness = _stiffening(
                     c, softening, MOMENT_RANGE * typical_moment(self.changes.model.arm)
                 )
-            inertia = self.scene.inertia_about(name, axes[:, k])
-            self._add_hinge(name, label, axes[:, k], stiffness=stiffness, inertia=inertia)
+            inertia = self.scene.inertia_about(name, axes[:, k], origin)
+            self._add_hinge(name, label, origin, axes[:, k], stiffness=stiffness, inertia=inertia)
             self.changed.append(f"joint {name}_{label}: stiffness {1 / c:.6g} Nm/rad")
 
-    def _play(self, name: str, joint: int, axis: Array) -> None:
-        """Add a limited hinge after a joint, and the friction that keeps its play taken up."""
+    def _play(self, name: str, joint: int, frame: Array) -> None:
+        """Add a limited hinge after a joint, and the friction that keeps its play taken up.
+
+        ``frame``: the joint's (4, 4) in world.
+        """
+        origin, axis = frame[:3, 3], frame[:3, 2]
         half = self.changes.of_joint(Kind.PLAY, joint) / 2
         if not half:
             return
@@ -198,18 +203,22 @@ class _Patch:
         # MuJoCo scales limits and friction by the inertia at its zero pose, which is close to zero
         # about the first axis of an arm that points straight up.
         softness = min(self.scene.inertia_about(name, axis) / largest, 1.0)
-        self._add_hinge(name, "backlash", axis, half_range=half, softness=softness)
+        self._add_hinge(name, "backlash", origin, axis, half_range=half, softness=softness)
         self.scene.add_friction_tendon(name, f"{name}_backlash", friction, softness)
         self.changed.append(
             f"joint {name}_backlash: +-{half:.6g} rad; tendon {name}_backlash_friction, "
             f"{friction:.3g} Nm, takes it up against the motion where no load does"
         )
 
-    def _add_hinge(self, name: str, label: str, axis: Array, **settings: Any) -> None:
+    def _add_hinge(self, name: str, label: str, origin: Array, axis: Array,
+                   **settings: Any) -> None:  # fmt: skip
+        """Add a hinge after a joint, through the origin (3,) of the cell's joint, in world.
+
+        The model's own joint can be elsewhere on the axis, where an axis across it is another line.
+        """
         body = self.scene.body_of(name)
-        hinge = Hinge(f"{name}_{label}", self.scene.anchor(name), self.scene.in_body(body, axis),
-                      **settings)  # fmt: skip
-        self.scene.add_hinge_after(name, hinge)
+        point, direction = self.scene.point_in(body, origin), self.scene.in_body(body, axis)
+        self.scene.add_hinge_after(name, Hinge(f"{name}_{label}", point, direction, **settings))
 
     def inertial(self, name: str, joint: int) -> None:
         """Scale mass and inertia of a joint's body, and move its centre of gravity."""

@@ -127,10 +127,6 @@ class Scene:
         frame = self.frame(body)
         return np.asarray(frame[:3, :3].T @ (point - frame[:3, 3]))
 
-    def anchor(self, joint: str) -> Array:
-        """Return a joint's anchor (3,) in its body's frame."""
-        return np.asarray(self.compiled.joint(joint).pos)
-
     def frame(self, body: Any) -> Array:
         """Return a body's frame (4, 4) in world."""
         return transform(self.data.xmat[body.id].reshape(3, 3), self.data.xpos[body.id])
