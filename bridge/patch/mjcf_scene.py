@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -135,7 +135,17 @@ class Scene:
         """Move a body and all that follow by a motion (4, 4) in world."""
         parent = self.frame(body.parent)
         local = np.linalg.inv(parent) @ motion @ self.frame(body)
-        self.place("body", body, local)
+        self.place("body", body, local @ self._written_in_frame(body))
+
+    def _written_in_frame(self, body: Any) -> Array:
+        """Return the frame (4, 4) that the file gives a body, its joints at ref, in its own here.
+
+        Angle zero is not where the file has a body whose joint has a ref.
+        """
+        local = np.linalg.inv(self.frame(body.parent)) @ self.frame(body)
+        w, x, y, z = self.compiled.body_quat[body.id]
+        turn = Rotation.from_quat([x, y, z, w]).as_matrix()
+        return np.asarray(np.linalg.inv(local) @ transform(turn, self.compiled.body_pos[body.id]))
 
     def place(self, tag: str, element: Any, in_parent: Array) -> None:
         """Set the frame (4, 4) of a body or site in its parent body's, when it is written."""
@@ -192,8 +202,11 @@ class Scene:
         self._tendons.append((joint, added, friction, softness))
 
     def insert_body_before(self, body: Any, name: str, hinges: Sequence[Hinge]) -> None:
-        """Insert a body with hinges between a body and its parent."""
-        self._before[body.name] = (name, [*self._before.get(body.name, (name, []))[1], *hinges])
+        """Insert a body with hinges, given in the frame of a body, between it and its parent."""
+        in_written = np.linalg.inv(self._written_in_frame(body))  # which the inserted body gets
+        turn, shift = in_written[:3, :3], in_written[:3, 3]
+        placed = [replace(h, point=turn @ h.point + shift, axis=turn @ h.axis) for h in hinges]
+        self._before[body.name] = (name, [*self._before.get(body.name, (name, []))[1], *placed])
 
     @property
     def added_joints(self) -> int:
