@@ -136,10 +136,11 @@ class _Patch:
         )
         if not (delay or lag or droop):
             return
-        actuator = next((a for a in self.scene.spec.actuators if a.target == name), None)
+        actuators = self.scene.spec.actuators
+        actuator = next((a for a in actuators if a.target == name and self._is_position(a)), None)
         if actuator is None:
-            self.missing.append(f"delay, lag or gain of {name}: it has no actuator; put them into "
-                                "the controller")  # fmt: skip
+            self.missing.append(f"delay, lag or gain of {name}: it has no position actuator; put "
+                                "them into the controller")  # fmt: skip
             return
         if delay:
             actuator.delay = delay + (actuator.delay if self.options.on_top else 0.0)
@@ -159,14 +160,29 @@ class _Patch:
             self._soften(actuator, droop)
             self.changed.append(f"actuator of {name}: kp {actuator.gainprm[0]:.6g}")
 
+    def _is_position(self, actuator: Any) -> bool:
+        """Return whether an actuator drives a joint to a position, as no motor does."""
+        mujoco, kp = self.scene.mujoco, actuator.gainprm[0]
+        joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        own = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER,
+               mujoco.mjtDyn.mjDYN_FILTEREXACT)  # fmt: skip
+        return bool(
+            actuator.trntype in joint and actuator.dyntype in own and kp > 0
+            and actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED
+            and actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE
+            and actuator.biasprm[1] == -kp and actuator.gear[0]
+        )  # fmt: skip
+
     def _soften(self, actuator: Any, droop: float) -> None:
-        """Set the gain of a position actuator so that it droops by ``droop`` rad/Nm."""
+        """Set the gain of a position actuator so that its joint droops by ``droop`` rad/Nm."""
         gain, bias = np.array(actuator.gainprm), np.array(actuator.biasprm)
-        earlier = 1 / gain[0] if self.options.on_top and gain[0] > 0 else 0.0  # in the user's model
-        droop += earlier
-        if gain[0] > 0 > bias[2]:  # positive is a damping ratio, which needs no change
-            bias[2] /= np.sqrt(droop * gain[0])
-        gain[0], bias[1] = 1 / droop, -1 / droop
+        gear2 = float(actuator.gear[0]) ** 2  # the joint's stiffness is kp gear^2
+        if self.options.on_top:
+            droop += 1 / (gain[0] * gear2)  # in the user's model
+        kp = 1 / (droop * gear2)
+        if bias[2] < 0:  # positive is a damping ratio, which needs no change
+            bias[2] *= np.sqrt(kp / gain[0])
+        gain[0], bias[1] = kp, -kp
         actuator.gainprm, actuator.biasprm = gain, bias
 
     def springs(self, name: str, joint: int) -> None:

@@ -88,3 +88,53 @@ def test_springs_of_joints_with_ref_bend_as_predicted(tmp_path: Path, term: Term
     deflected, rigid = model.predict(Q[None]).position[0], NOMINAL.predict(Q[None]).position[0]
     off = np.linalg.norm(tcp_in_base(found.text, held=True) - deflected)
     assert off < 0.01 * np.linalg.norm(deflected - rigid)
+
+
+SERVO = NOMINAL.with_terms([
+    Term("servo_droop", Site(2), (3e-5,)), Term("latency", Site(2), (0.02,)),
+    Term("tracking_lag", Site(2), (0.02,)),
+])  # fmt: skip
+
+
+def with_actuators(*elements: str) -> str:
+    """Return the model with actuators, ``{joint}`` replaced by each joint."""
+    written = "".join(e.format(joint=name) for name in UR_JOINTS for e in elements)
+    given = mjcf(ARM, UR_JOINTS)
+    return given.replace("<actuator></actuator>", f"<actuator>{written}</actuator>")
+
+
+@pytest.mark.parametrize(
+    "element",
+    [
+        '<motor joint="{joint}" gear="100"/>',
+        '<velocity joint="{joint}" kv="100"/>',
+        '<intvelocity joint="{joint}" kp="100" actrange="-3 3"/>',
+    ],
+    ids=["motor", "velocity", "intvelocity"],
+)
+def test_an_actuator_that_holds_no_position_stays_as_it_is(tmp_path: Path, element: str) -> None:
+    given = with_actuators(element)
+    found = patched(tmp_path / "a.xml", given, SERVO, PatchOptions())
+    after, before = (mujoco.MjModel.from_xml_string(t) for t in (found.text, given))
+    for key in ("gainprm", "biasprm", "dyntype", "dynprm", "delay"):
+        name = f"actuator_{key}"
+        assert np.array_equal(getattr(after, name), getattr(before, name)), name
+    assert any("shoulder_lift_joint: it has no position actuator" in m for m in found.unsupported)
+
+
+@pytest.mark.parametrize("on_top", [False, True])
+def test_droop_is_the_position_actuators_beside_another_one_and_over_a_gear(
+    tmp_path: Path, on_top: bool
+) -> None:
+    given = with_actuators(
+        '<velocity joint="{joint}" kv="100"/>', '<position joint="{joint}" kp="200" gear="10"/>'
+    )
+    found = patched(tmp_path / "a.xml", given, SERVO, PatchOptions(on_top=on_top))
+    after, before = (mujoco.MjModel.from_xml_string(t) for t in (found.text, given))
+    velocity, position = 2, 3  # of the second joint
+    assert after.actuator_gainprm[velocity, 0] == before.actuator_gainprm[velocity, 0]
+    assert after.actuator_dyntype[velocity] == before.actuator_dyntype[velocity]
+    droop = 1 / (after.actuator_gainprm[position, 0] * 10**2)
+    assert droop == pytest.approx(3e-5 + (1 / (200 * 10**2) if on_top else 0), rel=1e-5)
+    assert after.actuator_dyntype[position] == mujoco.mjtDyn.mjDYN_FILTEREXACT
+    assert not found.unsupported
