@@ -49,6 +49,10 @@ class Mjcf(ModelFormat):
         names = pick_joints(path, scene.hinges(), changes, options)
         world = base_in_world(changes.axes(), scene.axes(names), str(path), names)
         model = _Patch(scene, names, world, changes, options)
+        if disabled := scene.make_inertials_explicit():
+            model.changed.append(
+                f"compiler: {', '.join(disabled)} off; every body has its inertial"
+            )
         for joint, name in enumerate(names, start=1):
             model.frame(name, joint)
             model.friction(name, joint)
@@ -88,6 +92,11 @@ def _stiffening(c: float, softening: float, moment_limit: float) -> tuple[float,
     scale = np.linalg.norm(columns, axis=0)
     linear, cubic = np.linalg.lstsq(columns / scale, moment * slope, rcond=None)[0] / scale
     return float(linear), 0.0, float(cubic)
+
+
+def _named(body: Any) -> str:
+    """Return a body's name, or its number where it has none."""
+    return str(body.name) or f"#{body.id}"
 
 
 class _Patch:
@@ -237,22 +246,39 @@ class _Patch:
         self.scene.add_hinge_after(name, Hinge(f"{name}_{label}", point, direction, **settings))
 
     def inertial(self, name: str, joint: int) -> None:
-        """Scale mass and inertia of a joint's body, and move its centre of gravity."""
+        """Scale mass and inertia of a joint's link, and move its centre of gravity.
+
+        A link is the joint's body and all that are fixed to it.
+        """
         scale = 1 + self.changes.of_joint(Kind.LINK_SCALE, joint)
         moment = self.changes.vector(Kind.LINK_MOMENT, joint)
-        body = self.scene.body_of(name)
+        if scale == 1 and not moment.any():
+            return
+        link = self._link(name, joint)
+        if not link:
+            self.missing.append(f"inertia of the link of {name}: its bodies have no mass")
+            return
+        elements = [self.scene.inertial(body) for body in link]
+        named = f"body {', '.join(map(_named, link))}"
         if scale != 1:
-            element = self.scene.inertial(body)
-            element.mass *= scale
-            element.inertia = np.array(element.inertia) * scale
-            self.changed.append(f"body {body.name}: mass and inertia times {scale:.6g}")
+            for element in elements:
+                element.mass *= scale
+                element.inertia = np.array(element.inertia) * scale
+            self.changed.append(f"{named}: mass and inertia times {scale:.6g}")
         if moment.any():
-            element = self.scene.inertial(body)
             in_world = self.joint_in_world(joint)[:3, :3] @ moment
-            element.ipos = (
-                np.array(element.ipos) + self.scene.in_body(body, in_world) / element.mass
-            )
-            self.changed.append(f"body {body.name}: centre of gravity")
+            shift = in_world / sum(element.mass for element in elements)
+            for element in elements:
+                element.ipos = np.array(element.ipos) + self.scene.in_body(element, shift)
+            self.changed.append(f"{named}: centre of gravity")
+
+    def _link(self, name: str, joint: int) -> list[Any]:
+        """Return the bodies of a joint's link that have a mass."""
+        fixed = self.scene.fixed_to(self.scene.body_of(name), self.options.load or None)
+        masses = [self.scene.mass(body) for body in fixed]
+        if not self.changes.is_one_link(joint, masses):
+            del fixed[1:]
+        return [body for body, mass in zip(fixed, masses, strict=False) if mass > 0]
 
     def base(self) -> None:
         """Insert springs about the base axes before the first joint."""

@@ -101,7 +101,7 @@ class Scene:
         self._placed: dict[tuple[str, str], Array] = {}  # tag and name -> frame in its parent's
         self._after: dict[str, list[Hinge]] = {}  # by joint
         self._before: dict[str, tuple[str, list[Hinge]]] = {}  # by body: the body inserted before
-        self._explicit: set[str] = set()
+        self._explicit: set[int] = set()  # ids of bodies
         self._tendons: list[tuple[str, str, float, float]] = []
 
     def hinges(self) -> list[str]:
@@ -153,15 +153,49 @@ class Scene:
 
     def inertial(self, body: Any) -> Any:
         """Return a body with explicit mass, centre of gravity and inertia, to be changed."""
-        if body.name not in self._explicit:
+        if body.id not in self._explicit:
             compiled = self.compiled.body(body.id)
             body.explicitinertial = True
             body.mass = float(compiled.mass[0])
             body.ipos, body.iquat = compiled.ipos, compiled.iquat
             body.inertia, body.fullinertia = compiled.inertia, np.full(6, np.nan)
             body.ialt.type = self.mujoco.mjtOrientation.mjORIENTATION_QUAT
-            self._explicit.add(body.name)
+            self._explicit.add(body.id)
         return body
+
+    def make_inertials_explicit(self) -> list[str]:
+        """Give all bodies their masses and inertias where compiler options would change them.
+
+        Returns the names of the options, which are then off: they ignore or scale what a patch
+        writes into a body.
+        """
+        kinds = self.mujoco.mjtInertiaFromGeom
+        options = []
+        if self.spec.compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE:
+            options.append("inertiafromgeom")
+        if self.spec.compiler.settotalmass > 0:
+            options.append("settotalmass")
+        if options:
+            for body in self.spec.bodies[1:]:
+                self.inertial(body)
+            self.spec.compiler.inertiafromgeom = kinds.mjINERTIAFROMGEOM_AUTO
+            self.spec.compiler.settotalmass = -1
+        return options
+
+    def fixed_to(self, body: Any, without: str | None = None) -> list[Any]:
+        """Return a body and all that are fixed to it, which have no joints of their own.
+
+        ``without``: the name of a body that is left out, with those on it.
+        """
+        found = [body]
+        for child in body.bodies:
+            if not child.joints and child.name != without:
+                found += self.fixed_to(child, without)
+        return found
+
+    def mass(self, body: Any) -> float:
+        """Return a body's mass (kg) in the original."""
+        return float(self.compiled.body_mass[body.id])
 
     def inertia_about(self, joint: str, axis: Array, anchor: Array | None = None) -> float:
         """Return the inertia (kg m2) of all bodies from a joint on, about an axis in world."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS, mjcf, numbers
+from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS, mjcf, numbers, urdf
 from gapbridge.bridge.patch import Patched, PatchOptions, changes_of, format_of
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import Site, Term
@@ -138,3 +138,100 @@ def test_droop_is_the_position_actuators_beside_another_one_and_over_a_gear(
     assert droop == pytest.approx(3e-5 + (1 / (200 * 10**2) if on_top else 0), rel=1e-5)
     assert after.actuator_dyntype[position] == mujoco.mjtDyn.mjDYN_FILTEREXACT
     assert not found.unsupported
+
+
+INERTIA = NOMINAL.with_terms([
+    Term("link_inertia", Site(3), (0.25,)), Term("link_cog", Site(3), (0.4, -0.2, 0.1)),
+])  # fmt: skip
+
+
+def composite(text: str, *names: str) -> tuple[float, np.ndarray]:
+    """Return the mass (kg) and first moment (kg m) in world of bodies of an MJCF model."""
+    compiled = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(compiled)
+    mujoco.mj_forward(compiled, data)
+    ids = [compiled.body(name).id for name in names]
+    mass = compiled.body_mass[ids]
+    return float(mass.sum()), mass @ data.xipos[ids]
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["massless", "both"])
+def test_a_link_is_all_bodies_that_are_fixed_to_it(tmp_path: Path, own: bool) -> None:
+    """Mass and first moment of the link grow as the cell says, wherever its masses are."""
+    given = mjcf(ARM, UR_JOINTS)
+    inertial = re.search(r'<body name="link_3"[^>]*>(<inertial[^>]*/>)(<joint[^>]*/>)', given)
+    assert inertial is not None
+    shell = f'<body name="shell" pos="0.1 0 0" euler="1 0 0">{inertial[1]}</body>'
+    kept = inertial[1] if own else ""
+    given = given.replace(f"{inertial[1]}{inertial[2]}", f"{kept}{inertial[2]}{shell}")
+    found = patched(tmp_path / "a.xml", given, INERTIA, PatchOptions())
+    before, after = (composite(text, "link_3", "shell") for text in (given, found.text))
+    assert after[0] == pytest.approx(1.25 * before[0], rel=1e-5)
+    moved = BASE_TURN.inv().apply(after[1] - 1.25 * before[1])
+    frame = np.linalg.multi_dot(ARM.link_in_link[:3])[:3, :3]
+    axes = np.eye(3) if ARM.body_axes is None else ARM.body_axes[2]
+    assert np.allclose(moved, frame @ axes @ [0.4, -0.2, 0.1], rtol=0, atol=1e-4)
+    assert not found.unsupported
+
+
+def test_a_link_without_mass_is_listed(tmp_path: Path) -> None:
+    """MuJoCo takes such a link only if something is fixed to it, as here the load."""
+    model = NOMINAL.with_terms([Term("link_inertia", Site(6), (0.25,))])
+    given = {
+        "a.xml": re.sub(r'(<body name="link_6"[^>]*>)<inertial[^>]*/>', r"\1",
+                        mjcf(ARM, UR_JOINTS, load=4.0)),
+        "a.urdf": re.sub(r'(<link name="link_6">)\s*<inertial>.*?</inertial>', r"\1",
+                         urdf(ARM, UR_JOINTS), flags=re.DOTALL),
+    }  # fmt: skip
+    for name, text in given.items():
+        found = patched(tmp_path / name, text, model, PatchOptions())
+        assert [x for x in found.unsupported if "wrist_3_joint" in x and "no mass" in x]
+        assert not found.changed
+
+
+def test_what_is_fixed_to_the_last_link_is_of_it_where_the_cells_mass_has_it(
+    tmp_path: Path,
+) -> None:
+    model = NOMINAL.with_terms([Term("link_inertia", Site(6), (0.25,))])
+    given = mjcf(ARM, UR_JOINTS, load=4.0)
+    found = patched(tmp_path / "a.xml", given, model, PatchOptions())
+    after, before = (mujoco.MjModel.from_xml_string(t) for t in (found.text, given))
+    grown = [after.body(i).name for i in range(1, after.nbody)
+             if after.body_mass[i] > before.body_mass[i] + 1e-5]  # fmt: skip
+    assert grown == ["link_6"]
+
+
+def test_a_urdfs_link_is_all_links_that_are_fixed_to_it(tmp_path: Path) -> None:
+    given = urdf(ARM, UR_JOINTS)
+    inertial = re.search(r'<link name="link_3">(.*?)</link>', given, re.DOTALL)
+    assert inertial is not None
+    shell = (
+        '<joint name="fixed" type="fixed"><parent link="link_3"/><child link="shell"/></joint>'
+        f'<link name="shell">{inertial[1]}</link></robot>'
+    )
+    given = given.replace(inertial[0], '<link name="link_3"/>').replace("</robot>", shell)
+    found = patched(tmp_path / "a.urdf", given, INERTIA, PatchOptions())
+    assert f'<mass value="{1.25 * ARM.mass[2]:.17g}"' in found.text
+    assert any("shell: centre of gravity" in line for line in found.changed)
+
+
+@pytest.mark.filterwarnings("ignore:.*settotalmass.*deprecated")
+@pytest.mark.parametrize("option", ['inertiafromgeom="true"', 'settotalmass="30"'])
+def test_masses_change_alone_whatever_the_compiler_does_with_them(
+    tmp_path: Path, option: str
+) -> None:
+    model = NOMINAL.with_terms([
+        Term("link_inertia", Site(3), (0.25,)), Term("payload", Site(), (0.8,)),
+        Term("base_compliance", Site(), (1e-5, 1e-5)),
+    ])  # fmt: skip
+    given = mjcf(ARM, UR_JOINTS).replace('angle="radian"', f'angle="radian" {option}')
+    given = re.sub(r"(<inertial[^>]*/>)(<joint)", r'\1<geom size="0.05" mass="2"/>\2', given)
+    given = re.sub(r"(</?)geom([^>]*>)(<joint[^>]*/>)", r"\3\1geom\2", given)
+    found = patched(tmp_path / "a.xml", given, model, PatchOptions())
+    after, before = (mujoco.MjModel.from_xml_string(t) for t in (found.text, given))
+    for i in range(1, before.nbody):
+        name = before.body(i).name
+        wanted = before.body(i).mass[0] * (1.25 if name == "link_3" else 1.0)
+        assert after.body(name).mass[0] == pytest.approx(wanted, rel=1e-5), name
+    assert after.body("payload_difference").mass[0] == pytest.approx(0.8, rel=1e-5)
+    assert any(option.partition("=")[0] in line for line in found.changed)
