@@ -86,8 +86,7 @@ class Scene:
         self.mujoco = mujoco
         try:
             self.spec: Any = mujoco.MjSpec.from_file(str(path))
-            for joint in self.spec.joints:
-                joint.parent.name = joint.parent.name or f"{joint.name}_body"
+            self._name_bodies()
             self.compiled: Any = self.spec.compile()
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
@@ -104,10 +103,21 @@ class Scene:
         self._explicit: set[int] = set()  # ids of bodies
         self._tendons: list[tuple[str, str, float, float]] = []
 
+    def _name_bodies(self) -> None:
+        """Name the bodies of named joints, to be found in the XML; others can stay unnamed."""
+        taken = {body.name for body in self.spec.bodies}
+        for joint in self.spec.joints:
+            if joint.name and not joint.parent.name:
+                name = f"{joint.name}_body"
+                while name in taken:
+                    name += "_"
+                taken.add(name)
+                joint.parent.name = name
+
     def hinges(self) -> list[str]:
-        """Return the names of all hinges."""
+        """Return the names of all hinges that have one."""
         hinge = self.mujoco.mjtJoint.mjJNT_HINGE
-        return [j.name for j in self.spec.joints if j.type == hinge]
+        return [j.name for j in self.spec.joints if j.type == hinge and j.name]
 
     def axes(self, names: Sequence[str]) -> Axes:
         """Return the lines of joints' axes in world."""

@@ -235,3 +235,15 @@ def test_masses_change_alone_whatever_the_compiler_does_with_them(
         assert after.body(name).mass[0] == pytest.approx(wanted, rel=1e-5), name
     assert after.body("payload_difference").mass[0] == pytest.approx(0.8, rel=1e-5)
     assert any(option.partition("=")[0] in line for line in found.changed)
+
+
+def test_bodies_and_joints_of_a_scene_need_no_names(tmp_path: Path) -> None:
+    ball = '<body><freejoint/><geom size="0.1"/></body>'
+    door = '<body><joint/><geom size="0.1"/></body>'
+    own = '<body name="elbow_joint_body"/>'  # as the elbow's body would be named, had it no name
+    given = mjcf(ARM, UR_JOINTS).replace("<worldbody>", f"<worldbody>{2 * ball}{2 * door}{own}")
+    given = re.sub("<keyframe>.*</keyframe>", "", given.replace(' name="link_3"', ""))
+    model = OFFSET.with_terms([Term("backlash", Site(1), (0.002,))])
+    found = patched(tmp_path / "a.xml", given, model, PatchOptions(tcp="tcp"))
+    expected = OFFSET.predict(Q[None]).position[0]
+    assert np.allclose(tcp_in_base(found.text), expected, rtol=0, atol=SIX_DIGITS)
