@@ -24,7 +24,7 @@ from gapbridge.core.rotation import transform
 
 ARMATURE = 1e-3  # kg m2 of an added joint, which MuJoCo needs to integrate stiff springs
 DAMPING = 0.3  # damping ratio of an added joint
-FOLDERS = ("meshdir", "texturedir", "assetdir")  # of <compiler>, relative to the file
+FOLDERS = ("meshdir", "texturedir")  # of <compiler>; MuJoCo writes assetdir as both
 PLACED = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
 WRAPPER_MASS = 1e-6  # kg: MuJoCo requires more than zero of a moving body
 SOLREF = (0.004, 1.0)  # of play and of the friction across it
@@ -382,17 +382,17 @@ def _write_tendon(
 
 
 def _rebase(root: ElementTree.Element, old: Path, new: Path) -> None:
-    """Write the folders of meshes and textures relative to another folder."""
-    files = [e for e in root.iterfind("./asset/*") if e.get("file")]
-    if not files:
+    """Write the folders of meshes and textures relative to another folder.
+
+    Both, whether the model has them or not: it may have files of either kind.
+    """
+    if not any(key.startswith("file") for e in root.iter() for key in e.attrib):
         return
     compiler = root.find("compiler")
     if compiler is None:
         compiler = ElementTree.Element("compiler")
         root.insert(0, compiler)
-    folders = {key: compiler.get(key) for key in FOLDERS}
-    keys = [key for key in FOLDERS if folders[key] is not None] or ["assetdir"]
-    for key in keys:
-        folder = Path(folders[key] or "")
+    for key in FOLDERS:
+        folder = Path(compiler.get(key, ""))
         if not folder.is_absolute():
             compiler.set(key, os.path.relpath(old / folder, new))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -247,3 +249,50 @@ def test_bodies_and_joints_of_a_scene_need_no_names(tmp_path: Path) -> None:
     found = patched(tmp_path / "a.xml", given, model, PatchOptions(tcp="tcp"))
     expected = OFFSET.predict(Q[None]).position[0]
     assert np.allclose(tcp_in_base(found.text), expected, rtol=0, atol=SIX_DIGITS)
+
+
+MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+SIDES = ("right", "left", "up", "down", "front", "back")
+
+
+def white_png() -> bytes:
+    """Return a PNG image of one white pixel."""
+    text = b"\x89PNG\r\n\x1a\n"
+    for kind, data in (
+        (b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 2, 0, 0, 0)),
+        (b"IDAT", zlib.compress(b"\0\xff\xff\xff")),
+        (b"IEND", b""),
+    ):
+        text += struct.pack(">I", len(data)) + kind + data
+        text += struct.pack(">I", zlib.crc32(kind + data))
+    return text
+
+
+@pytest.mark.parametrize(
+    ("folders", "assets"),
+    [
+        ("", '<mesh file="in/a.obj"/><texture type="2d" file="b.png"/>'),
+        ('assetdir="in"', '<mesh file="a.obj"/><texture type="2d" file="c.png"/>'),
+        ('meshdir="in"', '<mesh file="a.obj"/><texture type="2d" file="b.png"/>'),
+        ('texturedir="in"', '<mesh file="in/a.obj"/><texture type="2d" file="c.png"/>'),
+        ("", '<texture type="cube" ' + " ".join(f'file{s}="b.png"' for s in SIDES) + "/>"),
+    ],
+    ids=["none", "assetdir", "meshdir", "texturedir", "cube"],
+)
+def test_a_model_in_another_folder_finds_its_files(
+    tmp_path: Path, folders: str, assets: str
+) -> None:
+    (tmp_path / "model" / "in").mkdir(parents=True)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "model" / "in" / "a.obj").write_text(MESH)
+    for image in ("b.png", "in/c.png"):
+        (tmp_path / "model" / image).write_bytes(white_png())
+    assets = assets.replace("<texture", '<texture name="t"').replace("<mesh", '<mesh name="m"')
+    given = mjcf(ARM, UR_JOINTS).replace(
+        '<compiler angle="radian"/>',
+        f'<compiler angle="radian" {folders}/><asset>{assets}</asset>',
+    )
+    options = PatchOptions(folder=tmp_path / "out")
+    found = patched(tmp_path / "model" / "a.xml", given, OFFSET, options)
+    (tmp_path / "out" / "b.xml").write_text(found.text)
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "b.xml")).ntex == 1
