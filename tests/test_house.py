@@ -100,6 +100,7 @@ LIBRARIES_ATTRIBUTES = {
     "bridge/patch/mjcf_scene.py": {
         "body.explicitinertial", "body.fullinertia", "body.ialt.type", "body.inertia", "body.ipos",
         "body.iquat", "body.mass", "joint.parent.name", "self.spec.comment",
+        "self.spec.compiler.inertiafromgeom", "self.spec.compiler.settotalmass",
     },
     "bridge/patch/usd.py": {"self.layer.comment", "self.layer.defaultPrim"},
     "bridge/served/server.py": {"server.should_exit"},  # uvicorn

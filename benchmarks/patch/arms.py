@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gapbridge.core.arm import Arm, arm_from_dh, builtin_arm
+from gapbridge.core.rotation import transform
 
 UR_JOINTS = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint",
              "wrist_1_joint", "wrist_2_joint", "wrist_3_joint")  # fmt: skip
@@ -58,6 +59,16 @@ def numbers(values: np.ndarray) -> str:
 def frame_turns(n: int) -> list[Rotation]:
     """Return how each body's frame is turned against the joint's frame: any, but known."""
     return [Rotation.from_rotvec([0.2 * i, -0.3, 0.1 * i]) for i in range(n + 1)]
+
+
+def slid(arm: Arm, distances: np.ndarray) -> Arm:
+    """Return the same arm with joint frames elsewhere on their axes: ``distances`` (n,) in m."""
+    links, cog = arm.link_in_link.copy(), arm.cog.copy()
+    for i, distance in enumerate(distances):
+        links[i] = links[i] @ transform(np.eye(3), np.array([0.0, 0.0, distance]))
+        links[i + 1] = transform(np.eye(3), np.array([0.0, 0.0, -distance])) @ links[i + 1]
+        cog[i] = cog[i] - [0.0, 0.0, distance]
+    return replace(arm, link_in_link=links, cog=cog)
 
 
 @dataclass(frozen=True)

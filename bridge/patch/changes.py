@@ -78,6 +78,17 @@ class ModelChanges:
                 total[s.axis] += s.value
         return total
 
+    def is_one_link(self, joint: int, masses: Sequence[float]) -> bool:
+        """Return whether a joint's body (its mass first) and those fixed to it are one link.
+
+        After the last joint they can be the tool or the load, which the cell has elsewhere: its
+        mass of that link tells. ``masses`` in kg.
+        """
+        if joint < self.n:
+            return True
+        of_link = self.model.arm.mass[-1]
+        return bool(abs(sum(masses) - of_link) < abs(masses[0] - of_link))
+
     def motion(self, joint: int, base_in_world: Array) -> Array:
         """Return the motion (4, 4) in world of all bodies from a joint (from 0; n: flange) on."""
         frame = base_in_world @ self.joint_in_base[joint]

@@ -49,6 +49,10 @@ class Mjcf(ModelFormat):
         names = pick_joints(path, scene.hinges(), changes, options)
         world = base_in_world(changes.axes(), scene.axes(names), str(path), names)
         model = _Patch(scene, names, world, changes, options)
+        if disabled := scene.make_inertials_explicit():
+            model.changed.append(
+                f"compiler: {', '.join(disabled)} off; every body has its inertial"
+            )
         for joint, name in enumerate(names, start=1):
             model.frame(name, joint)
             model.friction(name, joint)
@@ -88,6 +92,11 @@ def _stiffening(c: float, softening: float, moment_limit: float) -> tuple[float,
     scale = np.linalg.norm(columns, axis=0)
     linear, cubic = np.linalg.lstsq(columns / scale, moment * slope, rcond=None)[0] / scale
     return float(linear), 0.0, float(cubic)
+
+
+def _named(body: Any) -> str:
+    """Return a body's name, or its number where it has none."""
+    return str(body.name) or f"#{body.id}"
 
 
 class _Patch:
@@ -136,10 +145,11 @@ class _Patch:
         )
         if not (delay or lag or droop):
             return
-        actuator = next((a for a in self.scene.spec.actuators if a.target == name), None)
+        actuators = self.scene.spec.actuators
+        actuator = next((a for a in actuators if a.target == name and self._is_position(a)), None)
         if actuator is None:
-            self.missing.append(f"delay, lag or gain of {name}: it has no actuator; put them into "
-                                "the controller")  # fmt: skip
+            self.missing.append(f"delay, lag or gain of {name}: it has no position actuator; put "
+                                "them into the controller")  # fmt: skip
             return
         if delay:
             actuator.delay = delay + (actuator.delay if self.options.on_top else 0.0)
@@ -159,20 +169,36 @@ class _Patch:
             self._soften(actuator, droop)
             self.changed.append(f"actuator of {name}: kp {actuator.gainprm[0]:.6g}")
 
+    def _is_position(self, actuator: Any) -> bool:
+        """Return whether an actuator drives a joint to a position, as no motor does."""
+        mujoco, kp = self.scene.mujoco, actuator.gainprm[0]
+        joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        own = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER,
+               mujoco.mjtDyn.mjDYN_FILTEREXACT)  # fmt: skip
+        return bool(
+            actuator.trntype in joint and actuator.dyntype in own and kp > 0
+            and actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED
+            and actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE
+            and actuator.biasprm[1] == -kp and actuator.gear[0]
+        )  # fmt: skip
+
     def _soften(self, actuator: Any, droop: float) -> None:
-        """Set the gain of a position actuator so that it droops by ``droop`` rad/Nm."""
+        """Set the gain of a position actuator so that its joint droops by ``droop`` rad/Nm."""
         gain, bias = np.array(actuator.gainprm), np.array(actuator.biasprm)
-        earlier = 1 / gain[0] if self.options.on_top and gain[0] > 0 else 0.0  # in the user's model
-        droop += earlier
-        if gain[0] > 0 > bias[2]:  # positive is a damping ratio, which needs no change
-            bias[2] /= np.sqrt(droop * gain[0])
-        gain[0], bias[1] = 1 / droop, -1 / droop
+        gear2 = float(actuator.gear[0]) ** 2  # the joint's stiffness is kp gear^2
+        if self.options.on_top:
+            droop += 1 / (gain[0] * gear2)  # in the user's model
+        kp = 1 / (droop * gear2)
+        if bias[2] < 0:  # positive is a damping ratio, which needs no change
+            bias[2] *= np.sqrt(kp / gain[0])
+        gain[0], bias[1] = kp, -kp
         actuator.gainprm, actuator.biasprm = gain, bias
 
     def springs(self, name: str, joint: int) -> None:
         """Add play and springs after a joint: about its axis, then across it."""
-        axes = self.joint_in_world(joint)[:3, :3]
-        self._play(name, joint, axes[:, 2])
+        frame = self.joint_in_world(joint)
+        origin, axes = frame[:3, 3], frame[:3, :3]
+        self._play(name, joint, frame)
         flexibility = self.changes.springs.joint[joint - 1]
         softening = self.changes.springs.softening[joint - 1]
         for k, label in ((2, "axial_compliance"), (0, "radial_x"), (1, "radial_y")):
@@ -184,12 +210,16 @@ class _Patch:
                 stiffness = _stiffening(
                     c, softening, MOMENT_RANGE * typical_moment(self.changes.model.arm)
                 )
-            inertia = self.scene.inertia_about(name, axes[:, k])
-            self._add_hinge(name, label, axes[:, k], stiffness=stiffness, inertia=inertia)
+            inertia = self.scene.inertia_about(name, axes[:, k], origin)
+            self._add_hinge(name, label, origin, axes[:, k], stiffness=stiffness, inertia=inertia)
             self.changed.append(f"joint {name}_{label}: stiffness {1 / c:.6g} Nm/rad")
 
-    def _play(self, name: str, joint: int, axis: Array) -> None:
-        """Add a limited hinge after a joint, and the friction that keeps its play taken up."""
+    def _play(self, name: str, joint: int, frame: Array) -> None:
+        """Add a limited hinge after a joint, and the friction that keeps its play taken up.
+
+        ``frame``: the joint's (4, 4) in world.
+        """
+        origin, axis = frame[:3, 3], frame[:3, 2]
         half = self.changes.of_joint(Kind.PLAY, joint) / 2
         if not half:
             return
@@ -198,36 +228,57 @@ class _Patch:
         # MuJoCo scales limits and friction by the inertia at its zero pose, which is close to zero
         # about the first axis of an arm that points straight up.
         softness = min(self.scene.inertia_about(name, axis) / largest, 1.0)
-        self._add_hinge(name, "backlash", axis, half_range=half, softness=softness)
+        self._add_hinge(name, "backlash", origin, axis, half_range=half, softness=softness)
         self.scene.add_friction_tendon(name, f"{name}_backlash", friction, softness)
         self.changed.append(
             f"joint {name}_backlash: +-{half:.6g} rad; tendon {name}_backlash_friction, "
             f"{friction:.3g} Nm, takes it up against the motion where no load does"
         )
 
-    def _add_hinge(self, name: str, label: str, axis: Array, **settings: Any) -> None:
+    def _add_hinge(self, name: str, label: str, origin: Array, axis: Array,
+                   **settings: Any) -> None:  # fmt: skip
+        """Add a hinge after a joint, through the origin (3,) of the cell's joint, in world.
+
+        The model's own joint can be elsewhere on the axis, where an axis across it is another line.
+        """
         body = self.scene.body_of(name)
-        hinge = Hinge(f"{name}_{label}", self.scene.anchor(name), self.scene.in_body(body, axis),
-                      **settings)  # fmt: skip
-        self.scene.add_hinge_after(name, hinge)
+        point, direction = self.scene.point_in(body, origin), self.scene.in_body(body, axis)
+        self.scene.add_hinge_after(name, Hinge(f"{name}_{label}", point, direction, **settings))
 
     def inertial(self, name: str, joint: int) -> None:
-        """Scale mass and inertia of a joint's body, and move its centre of gravity."""
+        """Scale mass and inertia of a joint's link, and move its centre of gravity.
+
+        A link is the joint's body and all that are fixed to it.
+        """
         scale = 1 + self.changes.of_joint(Kind.LINK_SCALE, joint)
         moment = self.changes.vector(Kind.LINK_MOMENT, joint)
-        body = self.scene.body_of(name)
+        if scale == 1 and not moment.any():
+            return
+        link = self._link(name, joint)
+        if not link:
+            self.missing.append(f"inertia of the link of {name}: its bodies have no mass")
+            return
+        elements = [self.scene.inertial(body) for body in link]
+        named = f"body {', '.join(map(_named, link))}"
         if scale != 1:
-            element = self.scene.inertial(body)
-            element.mass *= scale
-            element.inertia = np.array(element.inertia) * scale
-            self.changed.append(f"body {body.name}: mass and inertia times {scale:.6g}")
+            for element in elements:
+                element.mass *= scale
+                element.inertia = np.array(element.inertia) * scale
+            self.changed.append(f"{named}: mass and inertia times {scale:.6g}")
         if moment.any():
-            element = self.scene.inertial(body)
             in_world = self.joint_in_world(joint)[:3, :3] @ moment
-            element.ipos = (
-                np.array(element.ipos) + self.scene.in_body(body, in_world) / element.mass
-            )
-            self.changed.append(f"body {body.name}: centre of gravity")
+            shift = in_world / sum(element.mass for element in elements)
+            for element in elements:
+                element.ipos = np.array(element.ipos) + self.scene.in_body(element, shift)
+            self.changed.append(f"{named}: centre of gravity")
+
+    def _link(self, name: str, joint: int) -> list[Any]:
+        """Return the bodies of a joint's link that have a mass."""
+        fixed = self.scene.fixed_to(self.scene.body_of(name), self.options.load or None)
+        masses = [self.scene.mass(body) for body in fixed]
+        if not self.changes.is_one_link(joint, masses):
+            del fixed[1:]
+        return [body for body, mass in zip(fixed, masses, strict=False) if mass > 0]
 
     def base(self) -> None:
         """Insert springs about the base axes before the first joint."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -24,7 +24,7 @@ from gapbridge.core.rotation import transform
 
 ARMATURE = 1e-3  # kg m2 of an added joint, which MuJoCo needs to integrate stiff springs
 DAMPING = 0.3  # damping ratio of an added joint
-FOLDERS = ("meshdir", "texturedir", "assetdir")  # of <compiler>, relative to the file
+FOLDERS = ("meshdir", "texturedir")  # of <compiler>; MuJoCo writes assetdir as both
 PLACED = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
 WRAPPER_MASS = 1e-6  # kg: MuJoCo requires more than zero of a moving body
 SOLREF = (0.004, 1.0)  # of play and of the friction across it
@@ -86,8 +86,7 @@ class Scene:
         self.mujoco = mujoco
         try:
             self.spec: Any = mujoco.MjSpec.from_file(str(path))
-            for joint in self.spec.joints:
-                joint.parent.name = joint.parent.name or f"{joint.name}_body"
+            self._name_bodies()
             self.compiled: Any = self.spec.compile()
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
@@ -101,13 +100,24 @@ class Scene:
         self._placed: dict[tuple[str, str], Array] = {}  # tag and name -> frame in its parent's
         self._after: dict[str, list[Hinge]] = {}  # by joint
         self._before: dict[str, tuple[str, list[Hinge]]] = {}  # by body: the body inserted before
-        self._explicit: set[str] = set()
+        self._explicit: set[int] = set()  # ids of bodies
         self._tendons: list[tuple[str, str, float, float]] = []
 
+    def _name_bodies(self) -> None:
+        """Name the bodies of named joints, to be found in the XML; others can stay unnamed."""
+        taken = {body.name for body in self.spec.bodies}
+        for joint in self.spec.joints:
+            if joint.name and not joint.parent.name:
+                name = f"{joint.name}_body"
+                while name in taken:
+                    name += "_"
+                taken.add(name)
+                joint.parent.name = name
+
     def hinges(self) -> list[str]:
-        """Return the names of all hinges."""
+        """Return the names of all hinges that have one."""
         hinge = self.mujoco.mjtJoint.mjJNT_HINGE
-        return [j.name for j in self.spec.joints if j.type == hinge]
+        return [j.name for j in self.spec.joints if j.type == hinge and j.name]
 
     def axes(self, names: Sequence[str]) -> Axes:
         """Return the lines of joints' axes in world."""
@@ -127,10 +137,6 @@ class Scene:
         frame = self.frame(body)
         return np.asarray(frame[:3, :3].T @ (point - frame[:3, 3]))
 
-    def anchor(self, joint: str) -> Array:
-        """Return a joint's anchor (3,) in its body's frame."""
-        return np.asarray(self.compiled.joint(joint).pos)
-
     def frame(self, body: Any) -> Array:
         """Return a body's frame (4, 4) in world."""
         return transform(self.data.xmat[body.id].reshape(3, 3), self.data.xpos[body.id])
@@ -139,7 +145,17 @@ class Scene:
         """Move a body and all that follow by a motion (4, 4) in world."""
         parent = self.frame(body.parent)
         local = np.linalg.inv(parent) @ motion @ self.frame(body)
-        self.place("body", body, local)
+        self.place("body", body, local @ self._written_in_frame(body))
+
+    def _written_in_frame(self, body: Any) -> Array:
+        """Return the frame (4, 4) that the file gives a body, its joints at ref, in its own here.
+
+        Angle zero is not where the file has a body whose joint has a ref.
+        """
+        local = np.linalg.inv(self.frame(body.parent)) @ self.frame(body)
+        w, x, y, z = self.compiled.body_quat[body.id]
+        turn = Rotation.from_quat([x, y, z, w]).as_matrix()
+        return np.asarray(np.linalg.inv(local) @ transform(turn, self.compiled.body_pos[body.id]))
 
     def place(self, tag: str, element: Any, in_parent: Array) -> None:
         """Set the frame (4, 4) of a body or site in its parent body's, when it is written."""
@@ -147,15 +163,49 @@ class Scene:
 
     def inertial(self, body: Any) -> Any:
         """Return a body with explicit mass, centre of gravity and inertia, to be changed."""
-        if body.name not in self._explicit:
+        if body.id not in self._explicit:
             compiled = self.compiled.body(body.id)
             body.explicitinertial = True
             body.mass = float(compiled.mass[0])
             body.ipos, body.iquat = compiled.ipos, compiled.iquat
             body.inertia, body.fullinertia = compiled.inertia, np.full(6, np.nan)
             body.ialt.type = self.mujoco.mjtOrientation.mjORIENTATION_QUAT
-            self._explicit.add(body.name)
+            self._explicit.add(body.id)
         return body
+
+    def make_inertials_explicit(self) -> list[str]:
+        """Give all bodies their masses and inertias where compiler options would change them.
+
+        Returns the names of the options, which are then off: they ignore or scale what a patch
+        writes into a body.
+        """
+        kinds = self.mujoco.mjtInertiaFromGeom
+        options = []
+        if self.spec.compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE:
+            options.append("inertiafromgeom")
+        if self.spec.compiler.settotalmass > 0:
+            options.append("settotalmass")
+        if options:
+            for body in self.spec.bodies[1:]:
+                self.inertial(body)
+            self.spec.compiler.inertiafromgeom = kinds.mjINERTIAFROMGEOM_AUTO
+            self.spec.compiler.settotalmass = -1
+        return options
+
+    def fixed_to(self, body: Any, without: str | None = None) -> list[Any]:
+        """Return a body and all that are fixed to it, which have no joints of their own.
+
+        ``without``: the name of a body that is left out, with those on it.
+        """
+        found = [body]
+        for child in body.bodies:
+            if not child.joints and child.name != without:
+                found += self.fixed_to(child, without)
+        return found
+
+    def mass(self, body: Any) -> float:
+        """Return a body's mass (kg) in the original."""
+        return float(self.compiled.body_mass[body.id])
 
     def inertia_about(self, joint: str, axis: Array, anchor: Array | None = None) -> float:
         """Return the inertia (kg m2) of all bodies from a joint on, about an axis in world."""
@@ -196,8 +246,11 @@ class Scene:
         self._tendons.append((joint, added, friction, softness))
 
     def insert_body_before(self, body: Any, name: str, hinges: Sequence[Hinge]) -> None:
-        """Insert a body with hinges between a body and its parent."""
-        self._before[body.name] = (name, [*self._before.get(body.name, (name, []))[1], *hinges])
+        """Insert a body with hinges, given in the frame of a body, between it and its parent."""
+        in_written = np.linalg.inv(self._written_in_frame(body))  # which the inserted body gets
+        turn, shift = in_written[:3, :3], in_written[:3, 3]
+        placed = [replace(h, point=turn @ h.point + shift, axis=turn @ h.axis) for h in hinges]
+        self._before[body.name] = (name, [*self._before.get(body.name, (name, []))[1], *placed])
 
     @property
     def added_joints(self) -> int:
@@ -329,17 +382,17 @@ def _write_tendon(
 
 
 def _rebase(root: ElementTree.Element, old: Path, new: Path) -> None:
-    """Write the folders of meshes and textures relative to another folder."""
-    files = [e for e in root.iterfind("./asset/*") if e.get("file")]
-    if not files:
+    """Write the folders of meshes and textures relative to another folder.
+
+    Both, whether the model has them or not: it may have files of either kind.
+    """
+    if not any(key.startswith("file") for e in root.iter() for key in e.attrib):
         return
     compiler = root.find("compiler")
     if compiler is None:
         compiler = ElementTree.Element("compiler")
         root.insert(0, compiler)
-    folders = {key: compiler.get(key) for key in FOLDERS}
-    keys = [key for key in FOLDERS if folders[key] is not None] or ["assetdir"]
-    for key in keys:
-        folder = Path(folders[key] or "")
+    for key in FOLDERS:
+        folder = Path(compiler.get(key, ""))
         if not folder.is_absolute():
             compiler.set(key, os.path.relpath(old / folder, new))

@@ -18,7 +18,7 @@ from gapbridge.bridge.patch.model_format import (
 )
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects.simulator import Kind
-from gapbridge.core.errors import ArmError, InputError
+from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import roll_pitch_yaw
 from gapbridge.core.urdf import axis_of, checked_urdf, numbers_of, origin_of
 
@@ -54,9 +54,9 @@ class Urdf(ModelFormat):
                 document.move(name, changes.motion(i, world), frames)
                 changed.append(f"joint {name}: origin")
             changed += _dynamics(document, name, i + 1, changes)
-        changed += _inertials(document, names, changes)
-        changed += _centres(document, names, changes, world, frames)
-        missing = [*_tool(document, path, changes, options, world, frames, changed),
+        inertials, without_mass = _inertials(document, names, changes, world, frames)
+        changed += inertials
+        missing = [*without_mass, *_tool(document, path, changes, options, world, frames, changed),
                    *_springs(changes), *_settings(changes)]  # fmt: skip
         document.comment(["Patched by gapbridge.", *changed, *notes,
                           *(f"not in this file: {line}" for line in missing)])  # fmt: skip
@@ -115,6 +115,19 @@ class _Document:
             point.append(frame[:3, 3])
             direction.append(frame[:3, :3] @ axis / np.linalg.norm(axis))
         return Axes(np.array(point), np.array(direction))
+
+    def mass(self, link: str) -> float:
+        """Return a link's mass (kg), 0 where it has none."""
+        element = self.links[link].find("inertial/mass")
+        return float(numbers_of(element, "value", "0", self.label(link, "link"))[0])
+
+    def fixed_to(self, link: str) -> list[str]:
+        """Return a link and all that are fixed to it."""
+        found = [link]
+        for name, joint in self.joints.items():
+            if joint.get("type") == "fixed" and self.end(name, "parent") == link:
+                found += self.fixed_to(self.end(name, "child"))
+        return found
 
     def move(self, joint: str, motion: Array, frames: dict[str, Array]) -> None:
         """Move a joint's child and all that follow by a motion (4, 4) in the root's frame."""
@@ -187,50 +200,61 @@ def _dynamics(document: _Document, name: str, joint: int, changes: ModelChanges)
     return [f"joint {name}: {key} {value:.6g}" for key, value in values.items()]
 
 
-def _inertials(document: _Document, names: Sequence[str], changes: ModelChanges) -> list[str]:
-    lines = []
-    for i, name in enumerate(names):
-        factor = 1 + changes.of_joint(Kind.LINK_SCALE, i + 1)
-        link = document.end(name, "child")
-        inertial = document.links[link].find("inertial")
-        if factor == 1 or inertial is None:
-            continue
-        for tag, keys in (("mass", ("value",)), ("inertia", ("ixx", "ixy", "ixz", "iyy", "iyz",
-                                                             "izz"))):  # fmt: skip
-            element = inertial.find(tag)
-            attributes = {} if element is None else element.attrib
-            values: dict[str, Array | float] = {
-                key: numbers_of(element, key, "0", document.label(link, "link")) * factor
-                for key in keys if key in attributes
-            }  # fmt: skip
-            if values:
-                document.write("link", link, tag, values)
-        lines.append(f"link {link}: mass and inertia times {factor:.6g}")
-    return lines
-
-
-def _centres(
+def _inertials(
     document: _Document, names: Sequence[str], changes: ModelChanges, world: Array,
     frames: dict[str, Array],
-) -> list[str]:  # fmt: skip
-    """Move links' centres of gravity by their first moments over their masses."""
-    lines = []
+) -> tuple[list[str], list[str]]:  # fmt: skip
+    """Scale links' masses and inertias, and move their centres of gravity.
+
+    A joint's link is its child and all that are fixed to it. Returns a line for each change, and
+    one for each that finds no mass.
+    """
+    lines, missing = [], []
     for i, name in enumerate(names):
-        moment, link = changes.vector(Kind.LINK_MOMENT, i + 1), document.end(name, "child")
-        inertial = document.links[link].find("inertial")
-        mass = None if inertial is None else inertial.find("mass")
-        if inertial is None or mass is None or not moment.any():
+        scale = 1 + changes.of_joint(Kind.LINK_SCALE, i + 1)
+        moment = changes.vector(Kind.LINK_MOMENT, i + 1)
+        if scale == 1 and not moment.any():
             continue
-        in_link = frames[link][:3, :3].T @ (world @ changes.joint_in_base[i])[:3, :3] @ moment
-        label = document.label(link, "link")
-        old = numbers_of(inertial.find("origin"), "xyz", "0 0 0", label)
-        (size,) = numbers_of(mass, "value", "0", label)
-        if size <= 0:
-            raise ArmError(f"{label}: mass value: found {size:g}, expected more than 0")
-        centre = old + in_link / (size * (1 + changes.of_joint(Kind.LINK_SCALE, i + 1)))
-        document.write("link", link, "origin", {"xyz": centre}, inside="inertial")
-        lines.append(f"link {link}: centre of gravity")
-    return lines
+        child = document.end(name, "child")
+        masses = {link: document.mass(link) for link in document.fixed_to(child)}
+        if not changes.is_one_link(i + 1, list(masses.values())):
+            masses = {child: masses[child]}
+        masses = {link: mass for link, mass in masses.items() if mass > 0}
+        if not masses:
+            missing.append(f"inertia of the link of {name}: {child} has no mass")
+            continue
+        if scale != 1:
+            for link in masses:
+                _scale(document, link, scale)
+            lines.append(f"link {', '.join(masses)}: mass and inertia times {scale:.6g}")
+        if moment.any():
+            in_world = (world @ changes.joint_in_base[i])[:3, :3] @ moment
+            shift = in_world / (sum(masses.values()) * scale)
+            for link in masses:
+                _shift_centre(document, link, frames[link][:3, :3].T @ shift)
+            lines.append(f"link {', '.join(masses)}: centre of gravity")
+    return lines, missing
+
+
+def _scale(document: _Document, link: str, factor: float) -> None:
+    """Scale a link's mass and inertia."""
+    inertia = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    for tag, keys in (("mass", ("value",)), ("inertia", inertia)):
+        element = document.links[link].find(f"inertial/{tag}")
+        attributes = {} if element is None else element.attrib
+        values: dict[str, Array | float] = {
+            key: numbers_of(element, key, "0", document.label(link, "link")) * factor
+            for key in keys if key in attributes
+        }  # fmt: skip
+        if values:
+            document.write("link", link, tag, values)
+
+
+def _shift_centre(document: _Document, link: str, shift: Array) -> None:
+    """Move a link's centre of gravity by a vector (3,) in m, in its frame."""
+    element = document.links[link].find("inertial/origin")
+    centre = numbers_of(element, "xyz", "0 0 0", document.label(link, "link")) + shift
+    document.write("link", link, "origin", {"xyz": centre}, inside="inertial")
 
 
 def _tool(

@@ -363,22 +363,27 @@ class _Layer:
 
     def springs(self, name: str, joint: int) -> None:
         """Add play and springs between a joint and its body: a small body and a joint each."""
-        frame = (self.world @ self.changes.joint_in_base[joint - 1])[:3, :3]
+        frame = self.world @ self.changes.joint_in_base[joint - 1]
         flexibility = self.changes.springs.joint[joint - 1]
         softening = self.changes.springs.softening[joint - 1]
         play = self.changes.of_joint(Kind.PLAY, joint)
         if play:
-            self._add_spring(name, "backlash", frame[:, 2], half=play / 2)
+            self._add_spring(name, "backlash", frame, 2, half=play / 2)
         for k, label in ((2, "axial_compliance"), (0, "radial_x"), (1, "radial_y")):
             if flexibility[k] > 0:
-                self._add_spring(name, label, frame[:, k], stiffness=1 / float(flexibility[k]))
+                self._add_spring(name, label, frame, k, stiffness=1 / float(flexibility[k]))
         if softening > 0:
             self.missing.append(f"stiffening of {name}: its spring is the linear one; a drive's "
                                 "stiffness by angle needs code")  # fmt: skip
 
     def _add_spring(
-        self, name: str, label: str, axis: Array, stiffness: float = 0.0, half: float = 0.0
-    ) -> None:
+        self, name: str, label: str, cell_frame: Array, k: int, stiffness: float = 0.0,
+        half: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Add a body and a joint about axis ``k`` of the cell's joint, its frame (4, 4) in world.
+
+        The stage's own joint can be elsewhere on the axis, where an axis across it is another line.
+        """
         stage, joint = self.stage, self.stage.joints[name]
         child = stage.body(joint, 1)
         path = f"{joint.GetPath()}_{label}"
@@ -394,7 +399,7 @@ class _Layer:
         spring.CreateAxisAttr().Set("Z")
         spring.CreateBody0Rel().SetTargets([f"{path}_body"])
         spring.CreateBody1Rel().SetTargets([child])
-        spring_frame = transform(_with_z(axis), frame[:3, 3])
+        spring_frame = transform(_with_z(cell_frame[:3, k]), cell_frame[:3, 3])
         stage.set_local(spring, 0, np.linalg.inv(frame) @ spring_frame)
         stage.set_local(spring, 1, np.linalg.inv(stage.frames[child]) @ spring_frame)
         joint.GetBody1Rel().SetTargets([f"{path}_body"])

@@ -13,6 +13,7 @@ from benchmarks.patch.arms import (
     UR_JOINTS,
     frame_turns,
     mjcf,
+    slid,
     urdf,
     written_arms,
 )
@@ -136,6 +137,20 @@ def test_springs_bend_as_predicted(tmp_path: Path, terms: list[Term]) -> None:
     found = settled(text, q)
     assert np.linalg.norm(found - deflected) < 0.01 * np.linalg.norm(deflected - rigid)
     assert any("nq is" in line for line in changed)
+
+
+@pytest.mark.parametrize("effect", ["axial_compliance", "radial_compliance"])
+def test_springs_bend_as_predicted_where_the_models_joints_are_elsewhere_on_their_axes(
+    tmp_path: Path, effect: str
+) -> None:
+    """As in Menagerie's UR10e, whose upper arm begins 176 mm along the axis of its joint."""
+    model = NOMINAL.with_terms([Term(effect, Site(2), (2e-5,))])
+    given = mjcf(slid(ARM, np.array([0.0, 0.176, 0.039, 0.0, 0.0, 0.0])), UR_JOINTS)
+    text, _, _ = patched(tmp_path / "a.xml", given, model, "tcp")
+    q = np.array([0.3, -0.9, 1.2, -0.4, 0.7, 0.2])
+    deflected, rigid = model.predict(q[None]).position[0], NOMINAL.predict(q[None]).position[0]
+    found = settled(text, q)
+    assert np.linalg.norm(found - deflected) < 0.01 * np.linalg.norm(deflected - rigid)
 
 
 def test_keyframes_still_hold_the_joints_angles(tmp_path: Path) -> None:

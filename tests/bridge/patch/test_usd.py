@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS, frame_turns
+from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS, frame_turns, slid
 from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
 from gapbridge.core.arm import Arm, builtin_arm
 from gapbridge.core.effects import Site, Term
@@ -160,6 +160,28 @@ def test_the_layer_holds_overs_alone_where_nothing_is_added(tmp_path: Path) -> N
     assert "def " not in found.text
     assert "@./a.usda@" in found.text
     assert "a note" in found.text
+
+
+@pytest.mark.parametrize("unit", [1.0, CENTIMETRES])
+def test_springs_are_at_the_cells_joint_where_the_stages_is_elsewhere_on_its_axis(
+    tmp_path: Path, unit: float
+) -> None:
+    write_stage(tmp_path / "a.usda", slid(ARM, np.full(6, 0.176)), unit, nested=False)
+    model = NOMINAL.with_terms([Term("radial_compliance", Site(2), (2e-5,))])
+    options = PatchOptions(folder=tmp_path)
+    found = format_of(tmp_path / "a.usda").patch(tmp_path / "a.usda", changes_of(model), options,
+                                                 [])  # fmt: skip
+    (tmp_path / "b.usda").write_text(found.text)
+    stage = Usd.Stage.Open(str(tmp_path / "b.usda"))
+    cells_joint = (ARM.link_in_link[0] @ ARM.link_in_link[1])[:3, 3]
+    for label in ("radial_x", "radial_y"):
+        spring = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath(f"/arm/{UR_JOINTS[1]}_{label}"))
+        for side, targets in enumerate((spring.GetBody0Rel(), spring.GetBody1Rel())):
+            prim = stage.GetPrimAtPath(targets.GetTargets()[0])
+            body = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T
+            body[:3, 3] *= unit
+            at = (body @ joint_frame(spring, side, unit))[:3, 3]
+            assert np.allclose(BASE_TURN.inv().apply(at - BASE_AT), cells_joint, rtol=0, atol=1e-5)
 
 
 def test_units_of_friction_damping_and_drives(tmp_path: Path) -> None:
