@@ -171,6 +171,21 @@ class _Stage:
         targets = relation.GetTargets()
         return str(targets[0]) if targets else ""
 
+    def fixed_to(self, path: str) -> list[str]:
+        """Return a body and all that fixed joints carry from it."""
+        fixed = [joint for joint in self._every_joint()
+                 if joint.GetPrim().IsA(self.UsdPhysics.FixedJoint)]  # fmt: skip
+        found = [path]
+        for body in found:  # which grows meanwhile
+            carried = [self.body(joint, 1) for joint in fixed if self.body(joint, 0) == body]
+            found += [child for child in carried if child not in found]
+        return found
+
+    def mass(self, path: str) -> float:
+        """Return a body's own physics:mass in the stage's unit, 0 where it has none."""
+        attribute = self.UsdPhysics.MassAPI(self.stage.GetPrimAtPath(path)).GetMassAttr()
+        return float(attribute.Get() or 0.0) if attribute else 0.0
+
     def authored(self, path: str) -> Array:
         """Return a prim's frame (4, 4) in world as the stage has it, m."""
         if not path:
@@ -334,32 +349,39 @@ class _Layer:
         self.changed.append(f"joint {name}: drive's stiffness {stiffness:.6g}")
 
     def inertial(self, name: str, joint: int) -> None:
-        """Scale mass and inertia of a joint's body, and move its centre of gravity."""
+        """Scale mass and inertia of a joint's link, and move its centre of gravity.
+
+        A link is the joint's body and all that fixed joints carry from it.
+        """
         scale = 1 + self.changes.of_joint(Kind.LINK_SCALE, joint)
         moment = self.changes.vector(Kind.LINK_MOMENT, joint)
         if scale == 1 and not moment.any():
             return
         path = self.stage.body(self.stage.joints[name], 1)
-        body = self.stage.UsdPhysics.MassAPI(self.stage.stage.GetPrimAtPath(path))
-        mass = body.GetMassAttr().Get() if body.GetMassAttr() else None
-        if not mass:
+        masses = {body: self.stage.mass(body) for body in self.stage.fixed_to(path)}
+        if not self.changes.is_one_link(joint, [m * self.stage.kilogram for m in masses.values()]):
+            masses = {path: masses[path]}
+        masses = {body: mass for body, mass in masses.items() if mass > 0}
+        if not masses:
             self.missing.append(f"inertia of {path}: it has no physics:mass that could be scaled")
             return
-        if scale != 1:
-            body.CreateMassAttr().Set(mass * scale)
-            inertia = body.GetDiagonalInertiaAttr().Get()
-            if inertia:
-                body.CreateDiagonalInertiaAttr().Set(inertia * scale)
-            self.changed.append(f"{path}: mass and inertia times {scale:.6g}")
-        if moment.any():
-            frame = self.stage.frames[path]
-            moment_in_world = (self.world @ self.changes.joint_in_base[joint - 1])[:3, :3] @ moment
-            shift = frame[:3, :3].T @ moment_in_world / (mass * scale * self.stage.kilogram)
-            authored = body.GetCenterOfMassAttr().Get()
-            centre = np.array(authored or (0, 0, 0), dtype=float)
-            centre = np.where(np.isfinite(centre), centre, 0.0) + shift / self.stage.unit
-            body.CreateCenterOfMassAttr().Set(self.stage.Gf.Vec3f(*(float(v) for v in centre)))
-            self.changed.append(f"{path}: physics:centerOfMass")
+        moment_in_world = (self.world @ self.changes.joint_in_base[joint - 1])[:3, :3] @ moment
+        shift = moment_in_world / (sum(masses.values()) * scale * self.stage.kilogram)
+        for body, mass in masses.items():
+            prim = self.stage.UsdPhysics.MassAPI(self.stage.stage.GetPrimAtPath(body))
+            if scale != 1:
+                prim.CreateMassAttr().Set(mass * scale)
+                inertia = prim.GetDiagonalInertiaAttr().Get()
+                if inertia:
+                    prim.CreateDiagonalInertiaAttr().Set(inertia * scale)
+                self.changed.append(f"{body}: mass and inertia times {scale:.6g}")
+            if moment.any():
+                in_body = self.stage.frames[body][:3, :3].T @ shift
+                authored = prim.GetCenterOfMassAttr().Get()
+                centre = np.array(authored or (0, 0, 0), dtype=float)
+                centre = np.where(np.isfinite(centre), centre, 0.0) + in_body / self.stage.unit
+                prim.CreateCenterOfMassAttr().Set(self.stage.Gf.Vec3f(*(float(v) for v in centre)))
+                self.changed.append(f"{body}: physics:centerOfMass")
 
     def springs(self, name: str, joint: int) -> None:
         """Add play and springs between a joint and its body: a small body and a joint each."""

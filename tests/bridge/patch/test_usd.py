@@ -214,6 +214,35 @@ def test_units_of_friction_damping_and_drives(tmp_path: Path) -> None:
     assert any("delay" in line for line in found.unsupported)
 
 
+@pytest.mark.parametrize("own", [0.0, 2.0])
+def test_a_link_is_all_bodies_that_are_fixed_to_it(tmp_path: Path, own: float) -> None:
+    write_stage(tmp_path / "a.usda", ARM, 1.0, nested=False)
+    given = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    link = UsdGeom.XformCache().GetLocalToWorldTransform(given.GetPrimAtPath("/arm/link_3"))
+    place(given, "/arm/shell", np.array(link).T, 1.0)
+    fixed = UsdPhysics.FixedJoint.Define(given, "/arm/shell_joint")
+    fixed.CreateBody0Rel().SetTargets(["/arm/link_3"])
+    fixed.CreateBody1Rel().SetTargets(["/arm/shell"])
+    for path, mass in (("/arm/link_3", own), ("/arm/shell", 3.0)):
+        UsdPhysics.MassAPI.Apply(given.GetPrimAtPath(path)).CreateMassAttr().Set(mass)
+    given.Save()
+    model = NOMINAL.with_terms([
+        Term("link_inertia", Site(3), (0.25,)), Term("link_cog", Site(3), (0.4, -0.2, 0.1)),
+    ])  # fmt: skip
+    kind, options = format_of(tmp_path / "a.usda"), PatchOptions(folder=tmp_path)
+    found = kind.patch(tmp_path / "a.usda", changes_of(model), options, [])
+    (tmp_path / "b.usda").write_text(found.text)
+    stage = Usd.Stage.Open(str(tmp_path / "b.usda"))
+    moment = 0.0
+    for path, mass in (("/arm/link_3", own), ("/arm/shell", 3.0)):
+        body = UsdPhysics.MassAPI(stage.GetPrimAtPath(path))
+        assert body.GetMassAttr().Get() == pytest.approx(1.25 * mass)
+        if mass:
+            moment += 1.25 * mass * np.linalg.norm(body.GetCenterOfMassAttr().Get())
+    assert moment == pytest.approx(np.linalg.norm([0.4, -0.2, 0.1]), rel=1e-5)
+    assert not found.unsupported
+
+
 def test_what_is_no_usd_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.usda").write_text("nothing")
     with pytest.raises(InputError, match="found no USD that opens, expected a stage") as error:
