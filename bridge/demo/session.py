@@ -185,11 +185,12 @@ class Session:
         """Return how the loop kept time over all runs."""
         cycles, missed = sum(r.cycles for r in self._runs), sum(r.missed for r in self._runs)
         span = sum(r.cycles / r.rate_hz for r in self._runs if r.rate_hz)
+        writing = [r for r in self._runs if r.setpoints_written]  # others: ages of what was read
         return LoopFigures(
             rate=cycles / span if span else 0.0,
             missed=missed,
             cycles=cycles + missed,
-            p99=max((r.age_ms["p99"] for r in self._runs), default=0.0) * 1e3,
+            p99=max((r.age_ms["p99"] for r in writing), default=0.0) * 1e3,
         )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -191,6 +193,16 @@ def test_a_rest_that_was_not_recorded_is_measured_again() -> None:
     assert found is None
     assert isinstance(missing, TooFewReadingsError)
     assert "visit 1: found no recorded cycle between" in str(missing)
+
+
+def test_the_age_behind_a_setpoint_is_of_runs_that_wrote_some(tmp_path: Path) -> None:
+    session: Any = Session(None, tmp_path, lambda _: None, Clock())  # type: ignore[arg-type]
+    run = {"cycles": 500, "missed": 5, "rate_hz": 500.0}
+    session._runs = [
+        SimpleNamespace(**run, setpoints_written=0, age_ms={"p99": 50.0}),  # ended before it armed
+        SimpleNamespace(**run, setpoints_written=480, age_ms={"p99": 0.8}),
+    ]
+    assert session.figures() == LoopFigures(rate=500.0, missed=10, cycles=1010, p99=800.0)
 
 
 def test_repeatability_is_that_of_the_scatter() -> None:
