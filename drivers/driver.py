@@ -221,8 +221,8 @@ class Driver(ABC):
     def take_round_trip(self) -> float | None:
         """Return, once, a round-trip time measured since arming, s; None: no new one.
 
-        Never waits; called in each cycle, so that a delay that grows is told from clocks that
-        drift. Only a link with a clock of the controller needs it.
+        Never waits; called in each cycle, so that a delay that grows is not taken for a
+        clock that drifts. Only a link with a clock of the controller needs it.
         """
         return None
 

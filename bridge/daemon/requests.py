@@ -1,4 +1,4 @@
-"""What persons and programs request of a run: queued, told with who asked, then passed on."""
+"""What persons and programs request of a run: queued, logged with who asked, then passed on."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Requests:
     ``emit`` adds an event. ``zeros_moved`` returns why joints' zeros are not trusted, as texts;
     empty: they are. DISARM acknowledges what was known when it was made, and none of it if there is
     more by the time it is passed on. ``obstacle_to`` returns why a command must not reach the loop,
-    as text; empty: it may. It is given whether a zero had moved before the request was told, and
+    as text; empty: it may. It is given whether a zero had moved before the request was logged, and
     whether the request acknowledges that.
     """
 

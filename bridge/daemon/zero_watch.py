@@ -110,7 +110,8 @@ class ZeroWatch:
     def obstacle_to(self, command: Command, moved: bool, acknowledges: bool) -> str:
         """Return why a person's request must not reach the loop, as text; empty: it may.
 
-        ``moved``: a zero had, before the request was told; ``acknowledges``: the request does that.
+        ``moved``: a zero had, before the request was logged; ``acknowledges``: the request
+        acknowledges it.
         """
         if acknowledges:
             self.verification.acknowledge()

@@ -82,7 +82,7 @@ class ModelChanges:
         """Return whether a joint's body (its mass first) and those fixed to it are one link.
 
         After the last joint they can be the tool or the load, which the cell has elsewhere: its
-        mass of that link tells. ``masses`` in kg.
+        mass of that link decides. ``masses`` in kg.
         """
         if joint < self.n:
             return True

@@ -256,7 +256,7 @@ def _insignificant(selection: Selection) -> dict[int, Withdrawal]:
 
 
 def _on_bound(parameter: Parameter, value: float, may_be_gone: bool) -> bool:
-    """Return whether a value is on a bound that tells nothing of it.
+    """Return whether a value is on a bound, and so unknown.
 
     Of what adds up, as of a load, a lower bound below zero is what the model holds: it is gone.
     """

@@ -71,7 +71,7 @@ def _model_keys(cell: Cell) -> dict[str, Any]:
 
 
 def _identity(cell: Cell) -> dict[str, str]:
-    """Return what tells the cell's arm from another of its model; empty text: not given."""
+    """Return what identifies the cell's arm among others of its model; empty text: not given."""
     link = "" if cell.link is None else address_of(cell.link)
     return {"link": link, "serial": cell.calibration.serial}
 

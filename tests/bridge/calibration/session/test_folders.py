@@ -24,17 +24,21 @@ def cell_of(folder: Path, link: str, serial: str, instrument: str, name: str = "
     return load_cell(path)
 
 
-def resume(before: Cell, now: Cell) -> None:
-    """Start a session with one cell, and check whether another may resume it."""
+def refusal(before: Cell, now: Cell) -> str:
+    """Return why a session that was started with one cell cannot go on with another, as text."""
     entry = start_entry(before, SessionOptions("whole", None, before.calibration.instrument))
     options = SessionOptions("whole", None, now.calibration.instrument)
-    check_start(entry, now, options, Path("sessions/one"))
+    try:
+        check_start(entry, now, options, Path("sessions/one"))
+    except InputError as error:
+        return str(error)
+    return ""
 
 
 @pytest.mark.parametrize(
     ("link", "serial", "instrument", "why"),
     [
-        (LINK.replace(".10", ".11"), "A-1", GAUGE, r"link: found 'host 192.168.0.11', expected"),
+        (LINK.replace(".10", ".11"), "A-1", GAUGE, "link: found 'host 192.168.0.11', expected"),
         (LINK, "B-2", GAUGE, "calibration.serial: found 'B-2', expected 'A-1'"),
         (LINK, "A-1", GAUGE.replace("250.0", "251.0"), "zero is 0.251 m, expected 0.25 m"),
         (LINK, "A-1", "{kind: dial_gauge, unit: mm}", "zero is to be estimated, expected 0.25 m"),
@@ -46,9 +50,8 @@ def test_another_arm_or_zero_is_refused(
 ) -> None:
     before = cell_of(tmp_path, LINK, "A-1", GAUGE)
     now = cell_of(tmp_path, link, serial, instrument, "other.yaml")
-    with pytest.raises(InputError, match=why) as caught:
-        resume(before, now)
-    assert "\n" not in str(caught.value)
+    assert why in refusal(before, now)
+    assert "\n" not in refusal(before, now)
 
 
 @pytest.mark.parametrize(
@@ -57,8 +60,8 @@ def test_another_arm_or_zero_is_refused(
      ("{kind: sphere}", "{kind: sphere, radius: 0.03}")],
 )  # fmt: skip
 def test_another_radius_is_refused(tmp_path: Path, before: str, now: str) -> None:
-    with pytest.raises(InputError, match="radius is"):
-        resume(cell_of(tmp_path, "", "", before), cell_of(tmp_path, "", "", now))
+    found = refusal(cell_of(tmp_path, "", "", before), cell_of(tmp_path, "", "", now))
+    assert "radius is" in found
 
 
 @pytest.mark.parametrize(
@@ -75,5 +78,5 @@ def test_a_copy_of_the_cell_resumes_it(
 ) -> None:
     before = cell_of(tmp_path, LINK, "A-1", GAUGE)
     now = cell_of(tmp_path, link, serial, instrument, "copy.yaml")
-    resume(before, now)
-    resume(now, before)
+    assert refusal(before, now) == ""
+    assert refusal(now, before) == ""
