@@ -14,12 +14,8 @@ from benchmarks.blind.mechanics import Array
 from benchmarks.fleet.simulating import KIND, TYPE, Habits, columns, write_type_cell
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.errors import ExcitationError
-from gapbridge.core.estimation.compliance_fit import (
-    Data,
-    fit_nuisances,
-    residual,
-    typical_flexibility,
-)
+from gapbridge.core.estimation.compliance_fit import Data, fit_nuisances, residual
+from gapbridge.core.estimation.flexibilities import typical_flexibility
 from gapbridge.core.estimation.hierarchical import fit_type
 from gapbridge.core.estimation.hierarchical_evidence import evidence
 from gapbridge.core.estimation.identification import identify_compliance

@@ -39,7 +39,7 @@ from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.bridge.report.labels import counted, effect_title, joint_list
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import InputError
-from gapbridge.core.estimation.compliance_fit import flexibilities
+from gapbridge.core.estimation.flexibilities import flexibilities
 from gapbridge.core.fitted_range import merged
 
 SHOWN = 8  # lines of each kind on the terminal

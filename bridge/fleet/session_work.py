@@ -12,7 +12,7 @@ import numpy as np
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.diagnosis import channels_of, diagnose
-from gapbridge.core.estimation.compliance_fit import flexibilities, typical_flexibility
+from gapbridge.core.estimation.flexibilities import flexibilities, typical_flexibility
 from gapbridge.core.estimation.hierarchical_evidence import evidence
 from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import Log

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array, Mask
-from gapbridge.core.effects import CATALOGUE
-from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.estimation import least_squares
+from gapbridge.core.estimation.flexibilities import flexibilities
 from gapbridge.core.estimation.geometry import Geometry, most_likely_geometry, with_geometry
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.registration import (
@@ -117,30 +116,6 @@ class Fit:
     def flexibility(self) -> Array:
         """Return the flexibilities (2n,) rad/Nm: axial, then radial."""
         return flexibilities(self.model)
-
-
-def flexibilities(model: Model) -> Array:
-    """Return the model's linear flexibilities (2n,) rad/Nm: axial, then radial.
-
-    Those that ``with_compliance`` replaces; nonlinear stiffness terms are not included.
-    """
-    values = np.zeros(2 * model.arm.n)
-    for term in model.terms:
-        kind = CATALOGUE[term.effect].flexibility
-        if kind and term.site.joint:
-            first = 0 if kind == "axial" else model.arm.n
-            values[first + term.site.joint - 1] += term.values[0]
-    return values
-
-
-def typical_flexibility(model: Model) -> float:
-    """Return a usual flexibility (rad/Nm) of a joint of an arm of this size."""
-    return 1e-3 / typical_moment(model.arm)
-
-
-def prior_of(model: Model) -> tuple[Array, float]:
-    """Return mean (2n,) and 1 sigma, rad/Nm, of the weak prior of the flexibilities."""
-    return flexibilities(model), 10 * typical_flexibility(model)
 
 
 def residual(model: Model, data: Data, frame: Registration | Placements) -> tuple[Array, Poses]:

@@ -18,10 +18,10 @@ from gapbridge.core.estimation.compliance_fit import (
     Fit,
     fit_flexibilities,
     fit_nuisances,
-    prior_of,
     residual,
     weighted_factor,
 )
+from gapbridge.core.estimation.flexibilities import prior_of
 from gapbridge.core.estimation.identification import measured_rows
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.robust import OUTLIER, distance_of, noise_of, scale_of

@@ -26,12 +26,12 @@ from gapbridge.core.estimation.compliance_fit import (
     fit_flexibilities,
     fit_nuisances,
     gap_after_registration,
-    prior_of,
     residual,
     tool_std,
     weighted_factor,
     with_free_geometry,
 )
+from gapbridge.core.estimation.flexibilities import prior_of
 from gapbridge.core.estimation.geometry import TOOL_STD, Geometry
 from gapbridge.core.estimation.held_out import FOLDS, joint_regions, random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out

@@ -29,12 +29,12 @@ from gapbridge.core.estimation.compliance_fit import (
     fit_flexibilities,
     fit_nuisances,
     gauss_newton_step,
-    prior_of,
     projected,
     residual,
     solve,
     with_free_geometry,
 )
+from gapbridge.core.estimation.flexibilities import prior_of
 from gapbridge.core.estimation.geometry import Geometry
 from gapbridge.core.estimation.held_out import FOLDS
 from gapbridge.core.estimation.identification import (

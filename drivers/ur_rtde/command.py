@@ -98,7 +98,8 @@ class ServoWriter:
         if state.runtime_state == PLAYING:
             raise WriteError(
                 f"{host}: found a program running on the controller, expected none: link.mode "
-                "'servoj' would end it; stop it, or use link.mode 'offset'"
+                "'servoj' would end it; stop it (an arming that was interrupted leaves its control "
+                "script), or use link.mode 'offset'"
             )
         if self._control is None:
             self._control = self._open()

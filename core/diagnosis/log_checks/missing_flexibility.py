@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from gapbridge.core.diagnosis.criteria import MAX_SHARE_AFTER_FLEXIBILITIES
 from gapbridge.core.errors import GapbridgeError
-from gapbridge.core.estimation.compliance_fit import flexibilities
+from gapbridge.core.estimation.flexibilities import flexibilities
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding

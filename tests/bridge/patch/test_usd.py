@@ -214,20 +214,24 @@ def test_units_of_friction_damping_and_drives(tmp_path: Path) -> None:
     assert any("delay" in line for line in found.unsupported)
 
 
-@pytest.mark.parametrize("own", [0.0, 2.0])
-def test_a_link_is_all_bodies_that_are_fixed_to_it(tmp_path: Path, own: float) -> None:
+@pytest.mark.parametrize(("own", "ends"), [(0.0, (0, 1)), (2.0, (0, 1)), (2.0, (1, 0))])
+def test_a_link_is_all_bodies_that_are_fixed_to_it(
+    tmp_path: Path, own: float, ends: tuple[int, int]
+) -> None:
     write_stage(tmp_path / "a.usda", ARM, 1.0, nested=False)
     given = Usd.Stage.Open(str(tmp_path / "a.usda"))
     link = UsdGeom.XformCache().GetLocalToWorldTransform(given.GetPrimAtPath("/arm/link_3"))
     place(given, "/arm/shell", np.array(link).T, 1.0)
     fixed = UsdPhysics.FixedJoint.Define(given, "/arm/shell_joint")
-    fixed.CreateBody0Rel().SetTargets(["/arm/link_3"])
-    fixed.CreateBody1Rel().SetTargets(["/arm/shell"])
+    bodies = ["/arm/link_3", "/arm/shell"]  # either way round: the joint joins them all the same
+    fixed.CreateBody0Rel().SetTargets([bodies[ends[0]]])
+    fixed.CreateBody1Rel().SetTargets([bodies[ends[1]]])
     for path, mass in (("/arm/link_3", own), ("/arm/shell", 3.0)):
         UsdPhysics.MassAPI.Apply(given.GetPrimAtPath(path)).CreateMassAttr().Set(mass)
     given.Save()
     model = NOMINAL.with_terms([
         Term("link_inertia", Site(3), (0.25,)), Term("link_cog", Site(3), (0.4, -0.2, 0.1)),
+        Term("joint_offset", Site(2), (0.004,)),
     ])  # fmt: skip
     kind, options = format_of(tmp_path / "a.usda"), PatchOptions(folder=tmp_path)
     found = kind.patch(tmp_path / "a.usda", changes_of(model), options, [])
@@ -240,6 +244,12 @@ def test_a_link_is_all_bodies_that_are_fixed_to_it(tmp_path: Path, own: float) -
         if mass:
             moment += 1.25 * mass * np.linalg.norm(body.GetCenterOfMassAttr().Get())
     assert moment == pytest.approx(np.linalg.norm([0.4, -0.2, 0.1]), rel=1e-5)
+    cache = UsdGeom.XformCache()
+    link, shell = (np.array(cache.GetLocalToWorldTransform(stage.GetPrimAtPath(path)))
+                   for path in ("/arm/link_3", "/arm/shell"))  # fmt: skip
+    assert np.abs(link - np.array(UsdGeom.XformCache().GetLocalToWorldTransform(
+        given.GetPrimAtPath("/arm/link_3")))).max() > 1e-3  # fmt: skip
+    assert shell == pytest.approx(link, abs=1e-6)
     assert not found.unsupported
 
 

@@ -11,7 +11,8 @@ from gapbridge.core.arm import arm_from_dh, builtin_rows
 from gapbridge.core.effects import flexibility_names
 from gapbridge.core.errors import ExcitationError, LogError
 from gapbridge.core.estimation import identification
-from gapbridge.core.estimation.compliance_fit import fit_nuisances, prior_of
+from gapbridge.core.estimation.compliance_fit import fit_nuisances
+from gapbridge.core.estimation.flexibilities import prior_of
 from gapbridge.core.estimation.held_out import random_folds
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.loads import Loads
