@@ -10,12 +10,16 @@ from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings
 from simulated_controller import SimulatedController
 
+from gapbridge.drivers.simulated.ur.controller import Controller
 from gapbridge.drivers.simulated.ur.programs.script_text import (
     Pose,
     parse_assignment,
     parse_call,
     take_script,
 )
+from gapbridge.drivers.simulated.ur.servers.rtde_protocol import output_recipe
+from gapbridge.drivers.simulated.ur.servers.script_server import ScriptServer
+from gapbridge.drivers.simulated.ur.settings import make_controller, simulated_cell
 
 FIELDS = (
     "actual_q,runtime_state,output_int_register_3,output_double_register_4,payload,tcp_offset,"
@@ -141,6 +145,63 @@ def test_a_wrong_line_stops_the_program_with_the_reason_in_the_log(
     assert sample["output_int_register_3"] == 0
     assert reason in controller.log()
     assert robot.play("def job():\n  sleep(0.01)\nend\n")["safety_mode"] == 1
+
+
+class Upload:
+    """Script text on its way to the port, without a socket."""
+
+    def __init__(self, text: str) -> None:
+        self.received = bytearray(text.encode())
+
+
+def after_upload(text: str) -> Controller:
+    """Return a controller of this process that has run an uploaded program for 0.4 s."""
+    controller = make_controller(simulated_cell("ur5e"))
+    ScriptServer(controller).handle(Upload(text))  # type: ignore[arg-type]
+    recipe = output_recipe([*FIELDS.split(","), "output_int_register_12"], version=2, every=1)
+    for _ in range(200):
+        controller.cycle()
+        recipe.encode(controller.memory)  # as a client's packet: it must always be possible
+    return controller
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "write_output_integer_register(12, 3.7)",
+        "write_output_integer_register(12, 3000000000)",
+        "write_output_integer_register(99, 1)",
+        "write_output_float_register(12, p[1, 2, 3, 0, 0, 0])",
+        "write_output_string_register(0, 1)",
+        "write_output_boolean_register()",
+        "set_standard_digital_out(70, True)",
+        "set_digital_out(-1, True)",
+        "set_payload(1.0, 0.5)",
+        "set_tcp(3)",
+        'sleep("a")',
+    ],
+)
+def test_a_value_that_a_register_cannot_hold_stops_the_program_and_not_the_controller(
+    line: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    controller = after_upload(f"def job():\n  {line}\n  set_payload(3.0)\nend\n")
+    assert controller.program is None
+    assert controller.declared.payload_mass != 3.0
+    assert "program job stops: " in caplog.text
+    assert "Traceback" not in caplog.text
+    assert len(controller.memory) == len(make_controller(simulated_cell("ur5e")).memory)
+
+
+@pytest.mark.parametrize(
+    "line", ["movej([0.5, -1.5, 1.8, -1.87, -1.57, 0.0])", "movej(3)", "stopl(2.0)"]
+)
+def test_a_secondary_program_does_not_move_the_arm(
+    line: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    controller = after_upload(f"sec note():\n  {line}\n  set_payload(3.0)\nend\n")
+    assert controller.target_q == Q
+    assert controller.declared.payload_mass != 3.0
+    assert "in a secondary program, which cannot move the arm" in caplog.text
 
 
 def test_a_setpoint_that_is_no_number_stops_the_program_and_not_the_arm_elsewhere(

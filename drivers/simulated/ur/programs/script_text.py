@@ -126,7 +126,7 @@ def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
         return _binary(node, names)
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         function = _FUNCTIONS.get(node.func.id)
-        if function is not None:
+        if function is not None and len(node.args) == 1:
             return function(_value(node.args[0], names))
     raise ValueError(ast.dump(node))
 

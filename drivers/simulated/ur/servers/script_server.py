@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gapbridge.drivers.simulated.server.connection import Connection
-from gapbridge.drivers.simulated.ur.controller import Controller, Steps
+from gapbridge.drivers.simulated.ur.controller import Controller, ScriptError, Steps
 from gapbridge.drivers.simulated.ur.programs import offset_program
 from gapbridge.drivers.simulated.ur.programs.control_motions import MOTIONS, REALTIME_MOTIONS
 from gapbridge.drivers.simulated.ur.programs.control_queries import QUERIES, REALTIME_QUERIES
@@ -57,12 +57,16 @@ class ScriptServer:
             controller.start_program(script.name, steps)
             return
         log.info("program %s uploaded (%d lines)", script.name, len(script.lines))
-        steps = script_program(controller, script.name, script.lines)
-        if script.kind == "sec":  # a secondary program runs beside and does not move the arm
+        secondary = script.kind == "sec"  # runs beside and does not move the arm
+        steps = script_program(controller, script.name, script.lines, secondary)
+        if not secondary:
+            controller.start_program(script.name, steps)
+            return
+        try:
             for _ in zip(range(1000), steps, strict=False):
                 pass
-            return
-        controller.start_program(script.name, steps)
+        except ScriptError as error:
+            log.warning("program %s stops: %s", script.name, error)
 
 
 @dataclass(frozen=True, slots=True)
