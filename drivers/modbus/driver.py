@@ -19,7 +19,6 @@ from gapbridge.drivers.modbus.decode import Decoder, Sample, check_identity
 from gapbridge.drivers.modbus.freshness import Freshness
 from gapbridge.drivers.modbus.map import compile_map
 from gapbridge.drivers.modbus.profile import read_profile
-from gapbridge.drivers.modbus.registers import UNITS
 from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.modbus.transport import Transport
 from gapbridge.drivers.modbus.write import make_writer
@@ -250,10 +249,7 @@ class ModbusDriver(Driver):
         coarsest = self.settings.coarsest or offset
         if coarsest == 0.0:
             return  # a rigid model: there is no offset
-        count = abs(write.target.scale) * UNITS[write.target.unit][1]
-        if write.target.type.startswith("f"):
-            count *= 1e-6  # a float's own resolution, of an angle of some radians
-        reach = self._model.length
+        count, reach = abs(write.target.resolution), self._model.length
         if count * reach > coarsest:
             raise WriteError(
                 f"{self.transport.name}: {self.profile.name}'s target registers are too coarse: "

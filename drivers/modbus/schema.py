@@ -6,10 +6,18 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from gapbridge.drivers.modbus.registers import LAST_ADDRESS, Coding, Table, TypeName, WordOrder
+from gapbridge.drivers.modbus.registers import (
+    LAST_ADDRESS,
+    UNITS,
+    Coding,
+    Table,
+    TypeName,
+    WordOrder,
+)
 from gapbridge.drivers.robot_modes import StopReason
 from gapbridge.drivers.section import Number, Positive, Section
 
+FLOAT_COUNT = 1e-6  # of one unit: about what a float's registers still distinguish of an angle
 Address = Annotated[int, Field(ge=0, le=LAST_ADDRESS, strict=True)]
 
 
@@ -43,6 +51,12 @@ class Vector(Place):
     unit: str = Field(description="rad, mrad, deg, turn, rad/s, degC, N, ...")
     stride: int | None = Field(default=None, ge=1, description="registers from one to the next")
     turns: Turns | None = Field(default=None, description="revolutions beside the angle")
+
+    @property
+    def resolution(self) -> float:
+        """Return the SI units in one count; of a float the smallest difference that it holds."""
+        count = self.scale * UNITS[self.unit][1]
+        return count * FLOAT_COUNT if self.type.startswith("f") else count
 
 
 class State(Section):

@@ -17,6 +17,7 @@ from gapbridge.core.errors import (
     ForeignCommandError,
     IneffectiveWriteError,
     LateSetpointError,
+    LinkError,
     RobotBusyError,
     StaleStateError,
     WriteError,
@@ -25,7 +26,7 @@ from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.decode import Sample
-from gapbridge.drivers.modbus.registers import UNITS, Table
+from gapbridge.drivers.modbus.registers import Table
 from gapbridge.drivers.modbus.schema import (
     Mailbox,
     ProfileFile,
@@ -275,8 +276,9 @@ class TargetWriter:
     def __init__(self, entry: TargetTrigger, transport: Transport, clock: Clock) -> None:
         self._now = clock.monotonic
         self._entry, self._transport = entry, transport
-        self._size = entry.target.scale * UNITS[entry.target.unit][1]
+        self._size = entry.target.resolution
         self._armed = False
+        self._may_move = False  # a motion of ours may be under way
         self._sent: dict[int, int] = {}
         self._target: Array | None = None
         self._since = 0.0
@@ -284,7 +286,7 @@ class TargetWriter:
     def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
         """Write speed and the like, once; no target, no trigger. Raises WriteError."""
         self._write_all(self._entry.before)
-        self._armed, self._sent, self._target = True, {}, None
+        self._armed, self._may_move, self._sent, self._target = True, True, {}, None
 
     def write(self, setpoint: Setpoint, sample: Sample, expiry: float = math.inf) -> None:
         """Send one target and trigger it. Raises WriteError.
@@ -348,9 +350,18 @@ class TargetWriter:
         return None
 
     def release(self) -> None:
-        """Stop the motion where the controller can; else it ends at the last target."""
-        if self._armed:
-            self._armed = False
+        """Stop the motion where the controller can; else it ends at the last target.
+
+        Also after a target that failed, and once more where the link had been closed by a lost
+        answer, or loses this one.
+        """
+        if not self._may_move:
+            return
+        self._armed = self._may_move = False
+        try:
+            self._write_all(self._entry.stop)
+        except LinkError:
+            self._transport.open()
             self._write_all(self._entry.stop)
 
     def target(self) -> Array | None:

@@ -12,7 +12,9 @@ from gapbridge.core.errors import (
     ForeignCommandError,
     IneffectiveWriteError,
     LateSetpointError,
+    LinkError,
     RobotBusyError,
+    StaleStateError,
     WriteError,
 )
 from gapbridge.core.state import Setpoint
@@ -46,10 +48,20 @@ class Wire:
     def __init__(self) -> None:
         self.written: list[tuple[str, int, list[int]]] = []
         self.number = 7  # the last one that the robot's program has applied
-        self.answers = True
+        self.lost = 0  # answers still to be lost, each of which closes the link
+        self.is_open = True
+
+    def open(self) -> None:
+        self.is_open = True
 
     def write(self, table: str, address: int, words: list[int], single: bool = False) -> None:
+        if not self.is_open:
+            raise LinkError("found no connection")
         self.written.append((table, address, list(words)))
+        if self.lost:
+            self.lost -= 1
+            self.is_open = False
+            raise StaleStateError("no answer")
 
     def sample(
         self, says: int = encode.RUNNING, *, busy: bool = False, q: Any = NOTHING,
@@ -308,3 +320,60 @@ def test_a_target_that_the_robot_refused_ends_the_writing() -> None:
     refused = wire.sample(q=q)._replace(motion=(("result", "out of reach"),))
     with pytest.raises(WriteError, match="the last target failed: out of reach"):
         writer.write(Setpoint(q, q, NOTHING), refused)
+
+
+def test_a_target_that_failed_is_stopped_all_the_same() -> None:
+    """A robot that is too slow is still on its way when the writing ends."""
+    writer, wire, clock = opened("niryo")
+    stop = [(write.table, write.address, [int(write.value)]) for write in writer._entry.stop]
+    assert stop
+    q = np.full(6, 0.1)
+    for failed in ("slow", "refused"):
+        writer.arm(types.SimpleNamespace(), wire.sample)
+        writer.write(Setpoint(q, q, NOTHING), wire.sample())
+        sample = wire.sample(q=0.5 * q)
+        if failed == "refused":
+            sample = sample._replace(motion=(("result", "aborted"),))
+        clock.now += writer._entry.following + 0.1
+        with pytest.raises(WriteError):
+            writer.write(Setpoint(q, q, NOTHING), sample)
+        wire.written.clear()
+        writer.release()
+        assert wire.written == stop, failed
+        writer.release()  # the robot may be somebody else's by now
+        assert wire.written == stop, failed
+
+
+@pytest.mark.parametrize("lost", ["target", "stop"])
+def test_a_lost_answer_does_not_keep_the_stop_from_a_robot_that_moves(lost: str) -> None:
+    writer, wire, _ = opened("niryo")
+    stop = [(write.table, write.address, [int(write.value)]) for write in writer._entry.stop]
+    q = np.full(6, 0.1)
+    writer.write(Setpoint(q, q, NOTHING), wire.sample())
+    wire.lost = 1
+    if lost == "target":
+        with pytest.raises(StaleStateError):
+            writer.write(Setpoint(0.5 * q, q, NOTHING), wire.sample(q=q))
+    writer.release()
+    assert wire.written[-1:] == stop
+    assert wire.is_open
+
+
+@pytest.mark.parametrize("kind", ["f32", "f64", "i32"])
+def test_a_target_in_floats_is_no_whole_number_of_degrees(kind: str) -> None:
+    profile = read_profile(ModbusSettings.shipped / "igus.yaml")
+    scale = {"scale": 0.01 if kind == "i32" else 1.0, "type": kind}
+    target = profile.write.target.model_copy(update=scale)  # type: ignore[union-attr]
+    write = profile.write.model_copy(update={"target": target})
+    wire = Wire()
+    writer = make_writer(
+        profile.model_copy(update={"write": write}), wire, lambda: (0.01, 0.02), 1.0, ByHand()
+    )  # type: ignore[arg-type]
+    writer.arm(types.SimpleNamespace(), wire.sample)  # type: ignore[arg-type]
+    q = np.full(6, 0.1)
+    writer.write(Setpoint(q, q, NOTHING), wire.sample())
+    reported = writer.target()
+    assert reported is not None
+    np.testing.assert_allclose(reported, q, atol=1e-4)
+    with pytest.raises(RobotBusyError):  # 5 mrad away: on its way
+        writer.write(Setpoint(q, q, NOTHING), wire.sample(q=q - 5e-3))
