@@ -22,6 +22,9 @@ from ports import own_host
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.recording.export import export
 from gapbridge.core.errors import InputError
+from gapbridge.drivers.clock import SYSTEM
+from gapbridge.drivers.ft_sensor.settings import RobotiqSettings
+from gapbridge.drivers.simulated.ft_sensor.serving import served_sensor
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -248,3 +251,29 @@ def test_a_sensor_that_no_other_process_can_reach_is_not_simulated(tmp_path: Pat
     )  # fmt: skip
     assert done.returncode == 2
     assert "ft_sensor.interface: found 'virtual', expected socketcand" in done.stderr
+
+
+@pytest.mark.parametrize("leads_to", ["device", "nowhere"])
+def test_somebody_elses_link_to_a_serial_line_is_not_replaced(
+    tmp_path: Path, leads_to: str
+) -> None:
+    """As /dev/serial/by-id/..., which leads to the real sensor; also with the plug pulled."""
+    (tmp_path / "device").write_text("the real one")
+    port = tmp_path / "by-id"
+    port.symlink_to(tmp_path / leads_to)
+    settings = RobotiqSettings(driver="robotiq_ft300", port=str(port))
+    with (
+        pytest.raises(InputError, match="by-id, expected a name that is free"),
+        served_sensor(settings, lambda: (0.0,) * 6, SYSTEM),
+    ):
+        pass
+    assert port.readlink() == tmp_path / leads_to
+
+
+def test_the_link_of_a_simulation_that_was_killed_is_replaced(tmp_path: Path) -> None:
+    port = tmp_path / "ft300"
+    port.symlink_to("/dev/pts/99999")
+    settings = RobotiqSettings(driver="robotiq_ft300", port=str(port))
+    with served_sensor(settings, lambda: (0.0,) * 6, SYSTEM):
+        assert port.exists()
+    assert not port.is_symlink()
