@@ -6,9 +6,9 @@ import logging
 from collections.abc import Callable, Sequence
 
 from gapbridge.drivers.modbus import encode
-from gapbridge.drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresses
+from gapbridge.drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresses, turns_of
 from gapbridge.drivers.modbus.registers import UNITS, Table
-from gapbridge.drivers.modbus.schema import Mailbox, ProfileFile, TargetTrigger
+from gapbridge.drivers.modbus.schema import Mailbox, ProfileFile, TargetTrigger, Vector
 from gapbridge.drivers.simulated.modbus.image import bad
 from gapbridge.drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
 from gapbridge.drivers.simulated.plant.motion import Hold
@@ -177,19 +177,25 @@ class TargetProgram:
             return
         self._due = False
         entry = self._entry.target
-        size = entry.scale * UNITS[entry.unit][1]
-        words = entry.coding.words
-        counts = [
-            entry.coding.decode(read(entry.table, a, words))[0]
-            for a in addresses(entry, self._profile.joints)
-        ]
+        joints = self._numbers(entry, read)
+        if entry.turns is not None:
+            turns = self._numbers(turns_of(entry, entry.turns), read)
+            joints = [angle + turn for angle, turn in zip(joints, turns, strict=True)]
         try:
-            controller.move_own(tuple(count * size for count in counts))
+            controller.move_own(tuple(joints))
             self._refused = False
             self._done += 1
         except BenchError as error:
             log.warning("target refused: %s", error)
             self._refused = True
+
+    def _numbers(self, entry: Vector, read: Read) -> list[float]:
+        """Return what clients have written to a vector of joints (n,), rad."""
+        size, coding = entry.scale * UNITS[entry.unit][1], entry.coding
+        return [
+            coding.decode(read(entry.table, address, coding.words))[0] * size
+            for address in addresses(entry, self._profile.joints)
+        ]
 
     def registers(self, controller: ArmController) -> list[tuple[Table, int, int]]:
         """Return whether a motion runs, and the result of the last one."""

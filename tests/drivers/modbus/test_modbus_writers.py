@@ -21,8 +21,10 @@ from gapbridge.core.state import Setpoint
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.decode import Sample
 from gapbridge.drivers.modbus.profile import read_profile
+from gapbridge.drivers.modbus.schema import Turns
 from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.modbus.write import MailboxWriter, TargetWriter, make_writer
+from gapbridge.drivers.simulated.modbus.programs import TargetProgram
 
 NOTHING = np.zeros(6)
 
@@ -377,3 +379,20 @@ def test_a_target_in_floats_is_no_whole_number_of_degrees(kind: str) -> None:
     np.testing.assert_allclose(reported, q, atol=1e-4)
     with pytest.raises(RobotBusyError):  # 5 mrad away: on its way
         writer.write(Setpoint(q, q, NOTHING), wire.sample(q=q - 5e-3))
+
+
+def test_the_simulated_robot_reads_the_turns_of_a_target() -> None:
+    profile = read_profile(ModbusSettings.shipped / "igus.yaml")
+    entry = profile.write.target.model_copy(  # type: ignore[union-attr]
+        update={"type": "u16", "scale": 1.0, "unit": "mrad", "turns": Turns(address=160)}
+    )
+    write = profile.write.model_copy(update={"target": entry})
+    q = [-0.5, 7.0, 1.0, 2.0, 3.0, -4.0]
+    registers = encode.vector_registers(entry, q)
+    goals: list[Any] = []
+    controller: Any = types.SimpleNamespace(move_own=goals.append)
+    program = TargetProgram(profile.model_copy(update={"write": write}), write)
+    for one in write.trigger:
+        program.wrote(controller, one.table, one.address, [int(one.value)])
+    program.cycle(controller, lambda _, first, count: [registers[first + k] for k in range(count)])
+    np.testing.assert_allclose(goals, [q], atol=1e-3)
