@@ -7,6 +7,10 @@ import struct
 
 from simulated_controller import SimulatedController
 
+from gapbridge.drivers.simulated.ur import modes
+from gapbridge.drivers.simulated.ur.servers.dashboard_server import DashboardServer
+from gapbridge.drivers.simulated.ur.servers.primary_server import PrimaryServer
+from gapbridge.drivers.simulated.ur.settings import make_controller, simulated_cell
 from gapbridge.drivers.ur_rtde.enquiry import CONFIGURATION, STATE, _parts
 
 UR10 = 2  # RobotType of the client library, for the e-Series too
@@ -28,3 +32,28 @@ def test_the_dashboard_flushes_its_log(controller: SimulatedController) -> None:
         s.readline()
         link.sendall(b"saveLog\n")
         assert s.readline() == "Log saved to disk\n"
+
+
+def test_the_robot_mode_data_tell_a_pause_power_and_the_slider() -> None:
+    controller = make_controller(simulated_cell("ur10e"))
+    server = PrimaryServer(controller, (5, 15, 0), (), ())
+    dashboard = DashboardServer(controller, "5.15.0.0", "1")
+
+    def told() -> tuple[bool, bool, bool, float]:
+        """Return power_on, program_running, program_paused, target_speed_fraction."""
+        fields = struct.unpack(">Q7?bB3dB", server._mode()[5:])
+        return fields[3], fields[6], fields[7], fields[10]
+
+    dashboard.answer("load job.urp")
+    dashboard.answer("play")
+    for _ in range(50):
+        controller.cycle()
+    controller.write_inputs({"speed_slider_mask": 1, "speed_slider_fraction": 0.3})
+    assert told() == (True, True, False, 0.3)
+    dashboard.answer("pause")
+    assert told() == (True, False, True, 0.3)
+    dashboard.answer("stop")
+    controller.set_robot_mode(modes.IDLE)
+    assert told() == (True, False, False, 0.3)
+    dashboard.answer("power off")
+    assert told() == (False, False, False, 0.3)

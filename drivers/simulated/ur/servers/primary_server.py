@@ -65,13 +65,15 @@ class PrimaryServer:
 
     def _mode(self) -> bytes:
         memory = self._controller.memory
-        running = memory["robot_mode"] == modes.RUNNING
+        powered = memory["robot_mode"] >= modes.POWER_ON
         playing = memory["runtime_state"] == modes.PLAYING
+        paused = memory["runtime_state"] == modes.PAUSED
         stopped = memory["safety_mode"] == modes.SAFETY_PROTECTIVE
         emergency = memory["safety_mode"] == modes.SAFETY_ROBOT_EMERGENCY
         body = struct.pack(
-            ">Q7?bB3dB", int(1e6 * self._controller.clock), True, True, running, emergency, stopped,
-            playing, False, memory["robot_mode"], 0, 1.0, memory["speed_scaling"], 1.0, 0,
+            ">Q7?bB3dB", int(1e6 * self._controller.clock), True, True, powered, emergency, stopped,
+            playing, paused, memory["robot_mode"], 0, memory["target_speed_fraction"],
+            memory["speed_scaling"], 1.0, 0,
         )  # fmt: skip
         return _part(MODE, body)
 
