@@ -96,7 +96,7 @@ class Controller:
         if self.starts_in > 0.0:
             self.starts_in -= dt
             if self.starts_in <= 0.0:
-                self.set_runtime(modes.PLAYING)
+                self.set_runtime(modes.PLAYING if self.can_move else modes.PAUSED)
             return
         if self.memory["runtime_state"] != modes.PLAYING:
             return

@@ -11,6 +11,7 @@ from simulated_cell import Bench, cell_settings
 from simulated_controller import SimulatedController
 
 from gapbridge.drivers.simulated.ur.controller import Controller
+from gapbridge.drivers.simulated.ur.modes import PAUSED
 from gapbridge.drivers.simulated.ur.programs.script_text import (
     Pose,
     parse_assignment,
@@ -202,6 +203,18 @@ def test_a_secondary_program_does_not_move_the_arm(
     assert controller.target_q == Q
     assert controller.declared.payload_mass != 3.0
     assert "in a secondary program, which cannot move the arm" in caplog.text
+
+
+def test_a_program_that_a_protective_stop_meets_before_its_first_line_is_paused() -> None:
+    controller = make_controller(simulated_cell("ur5e"))
+    line = "movej([0.5, -1.5, 1.8, -1.87, -1.57, 0.0])\n"
+    ScriptServer(controller).handle(Upload(line))  # type: ignore[arg-type]
+    controller.cycle()
+    controller.protective_stop()
+    for _ in range(100):
+        controller.cycle()
+    assert controller.memory["runtime_state"] == PAUSED
+    assert controller.target_q == Q
 
 
 def test_a_setpoint_that_is_no_number_stops_the_program_and_not_the_arm_elsewhere(
