@@ -242,6 +242,7 @@ class CanopenDriver(Driver):
 
     def _enable(self, sample: SyncSet) -> None:
         start = positions(self.profile, sample)
+        self.writer.load()  # first: without it nothing can be sent, not even what disables
         try:
             self.power.prepare()
             hold = self.power.enable(sample, self.settings.arming_time, self.settings.clear_faults)

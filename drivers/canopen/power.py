@@ -70,7 +70,6 @@ class Power:
                         "would go on when we are gone; heartbeat.drives_wait 0 accepts that"
                     )
                 self._watched.append(node)
-        self._writer.load()
 
     def restore(self) -> None:
         """Put back what ``prepare`` changed. Raises LinkError."""

@@ -312,6 +312,32 @@ def test_a_drive_that_cannot_be_enabled_leaves_none_enabled(generic: DriveArm) -
         assert Phase.ENABLED not in phases(generic)
 
 
+@pytest.mark.parametrize("refused", ["write", "read"])
+def test_a_drive_that_refuses_an_object_while_arming_leaves_all_as_they_were(
+    refused: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The drives are switched on, and an object that we do not command is in their RPDO."""
+    with served("lwa4p") as arm, arm.driver() as driver:
+        node, master = node_of(arm, 3), driver.master
+        state = settled(driver)
+        for drive in arm.server.drives:
+            drive.axis.machine.phase = Phase.SWITCHED_ON
+        known = getattr(master, refused)
+
+        def refuse(asked: int, *given: object) -> object:
+            if asked == node:
+                raise LinkError(f"node {asked} refuses")
+            return known(asked, *given)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(master, refused, refuse)
+            with pytest.raises(WriteError, match=f"node {node} refuses"):
+                driver.arm(state)
+        assert Phase.ENABLED not in phases(arm)
+        if refused == "read":  # nothing was written before it
+            assert {drive.axis.mode for drive in arm.server.drives} == {0}
+
+
 def test_drives_stop_by_themselves_when_we_fall_silent(
     generic: DriveArm, driver: CanopenDriver
 ) -> None:
