@@ -12,7 +12,7 @@ input_int_register_20      checksum: sum of round(1e9 v) over the six, plus regi
 input_int_register_21      heartbeat: any change
 input_int_register_22      rates: 65536 times m/s in 4e-5, plus rad/s in 1e-4
 output_int_register_12     sequence of the last offset that was accepted
-output_int_register_13     1 running, 2 watchdog expired (ramping to zero), 3 bad checksum
+output_int_register_13     1 running, 2 watchdog expired (ramping to zero), 3 bad checksum or rates
 output_double_register_12  applied offset: 12 to 17, x, y, z, rotation vector
 =========================  ====================================================================
 """
@@ -121,7 +121,7 @@ class OffsetRegisters:
             self._silent += dt
         if memory["input_int_register_19"] != self._sequence:
             self._take(memory)
-        if self._silent > HEARTBEAT_LIMIT:
+        if self._silent > HEARTBEAT_LIMIT + 0.5 * dt:  # as many cycles as the script counts
             self.wanted = NOTHING
             return EXPIRED
         return REJECTED if self._rejected else RUNNING
@@ -134,11 +134,13 @@ class OffsetRegisters:
         fits = all(map(math.isfinite, offset))
         rates = int(memory["input_int_register_22"])
         fits = fits and checksum(offset, sequence, rates) == memory["input_int_register_20"]
+        shift, turn = divmod(rates, 65536)
+        fits = fits and shift >= 1 and turn >= 1  # not so where the registers were cleared
         self._rejected = not fits
         if fits:
             self.steps = (
-                min(CYCLE * RATE_UNITS[0] * (rates // 65536), SHIFT_STEP),
-                min(CYCLE * RATE_UNITS[1] * (rates % 65536), TURN_STEP),
+                min(CYCLE * RATE_UNITS[0] * shift, SHIFT_STEP),
+                min(CYCLE * RATE_UNITS[1] * turn, TURN_STEP),
             )
             self._sequence, self.wanted = sequence, offset
             self._memory["output_int_register_12"] = sequence
