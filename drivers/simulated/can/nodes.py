@@ -21,6 +21,7 @@ from gapbridge.drivers.simulated.can.port import InnerPort
 from gapbridge.drivers.simulated.plant.kinematics import Joints
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 from gapbridge.drivers.simulated.server.bench import Command
+from gapbridge.drivers.simulated.server.connection import is_free
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 BACKLOG = 500  # frames read in one cycle at most
@@ -76,7 +77,7 @@ class CanNodes(ProtocolServer):
 
     def _put_terminal(self, channel: Path) -> None:
         assert self._hub is not None
-        if (channel.exists() and not channel.is_symlink()) or not channel.parent.is_dir():
+        if not is_free(channel):
             raise InputError(
                 f"found {channel}, expected a name that is free, as /tmp/arm, where a link to the "
                 "simulated serial line can be put",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -22,9 +21,9 @@ from gapbridge.drivers.simulated.can.hub import Hub
 from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode, RobotousNode
 from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
 from gapbridge.drivers.simulated.ft_sensor.node import Reaction, SimulatedSensor, reaction_at
+from gapbridge.drivers.simulated.server.connection import is_free
 
 RETRY = 0.1  # s between two tries at a bus that somebody else serves
-TERMINALS = "/dev/pts"  # where a simulated line's link leads; any other link is somebody's
 BETWEEN_PROCESSES = ("socketcand", "socketcan")
 
 
@@ -59,8 +58,7 @@ def served_sensor(
 def _device(settings: FtSensorSettings, reaction: Reaction, clock: Clock) -> SimulatedSensor:
     if isinstance(settings, RobotiqSettings):
         port = Path(settings.port)
-        ours = port.is_symlink() and Path(os.readlink(port)).is_relative_to(TERMINALS)
-        if (os.path.lexists(port) and not ours) or not port.parent.is_dir():
+        if not is_free(port):
             raise InputError(
                 f"ft_sensor.port: found {settings.port}, expected a name that is free, as "
                 "/tmp/ft300, where a link to the simulated line can be put"

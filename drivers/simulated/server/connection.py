@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
+from pathlib import Path
 
 SEND_BUFFER = 65536  # bytes the kernel may hold for a client that does not read
 MOST_PENDING = 262144  # bytes of replies kept for it here
 MOST_INPUT = 1 << 20  # bytes of an unfinished request
 CHUNK = 65536
+TERMINALS = "/dev/pts"  # pseudo-terminals
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -24,6 +27,17 @@ def listen(host: str, port: int) -> socket.socket:
         raise
     listener.setblocking(False)
     return listener
+
+
+def is_free(name: Path) -> bool:
+    """Return whether a link to a simulated serial line can be put there.
+
+    A link that leads to a pseudo-terminal was left by a simulation that was killed; any other is
+    somebody's, as /dev/serial/by-id/... to the real device.
+    """
+    if name.is_symlink():
+        return Path(os.readlink(name)).is_relative_to(TERMINALS)
+    return name.parent.is_dir() and not name.exists()
 
 
 class Connection:
