@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gapbridge.drivers.can.loading import read_profile
-from gapbridge.drivers.can.profile import Incoming, Outgoing
+from gapbridge.drivers.can.profile import Check, Incoming, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.robot_modes import StopReason
 from gapbridge.drivers.simulated.can.nodes import CanNodes
@@ -90,12 +90,21 @@ class MappedNodes(CanNodes):
             scale = profile.joints.scale[reading.quantity][reading.joint]
             values[reading.signal] = reported[reading.quantity][reading.joint] / scale
         for check in incoming.checks:
-            bad = [v for v, reason in check.values.items() if reason == StopReason.EMERGENCY_STOP]
-            values[check.signal] = (bad or [1])[0] if not controller.can_move else min(check.normal)
+            values[check.signal] = min(check.normal)
         for signal in incoming.enabled:
             yes = min(profile.enabled_values)
             values[signal] = yes if self._enabled else (0 if yes else 1)
+        for check in () if controller.can_move else incoming.checks:  # may be in the same signal
+            values[check.signal] = _stopped(check, controller.emergency)
         if incoming.counter is not None:
             length = incoming.message.get_signal_by_name(incoming.counter).length
             values[incoming.counter] = self._samples % (1 << length)
         return bytes(incoming.message.encode(values, strict=False))
+
+
+def _stopped(check: Check, emergency: bool) -> int:
+    """Return the value that reports a stop: of its kind where the profile names one."""
+    kind = StopReason.EMERGENCY_STOP if emergency else StopReason.PROTECTIVE_STOP
+    named = [value for value, reason in check.values.items() if reason == kind]
+    unknown = (value for value in range(len(check.normal) + 1) if check.stop_reason(value))
+    return named[0] if named else next(unknown)

@@ -1,6 +1,7 @@
 """An arm that no code knows: its firmware is written after its manual, not after our map."""
 
 import math
+import shutil
 import threading
 import time
 from pathlib import Path
@@ -11,9 +12,13 @@ import pytest
 from can_arm import MODEL, next_state, setpoint_of
 from patience import PATIENCE
 
+from gapbridge.core.errors import InputError
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.clock import SYSTEM
+from gapbridge.drivers.simulated.can.server import make_servers
+from gapbridge.drivers.simulated.server.arm_controller import make_controller
+from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 INVENTED = Path(__file__).with_name("invented.yaml")
 COUNT = math.radians(0.0005)
@@ -99,3 +104,54 @@ def test_an_arm_that_no_code_knows_is_read_armed_and_moved_from_data_alone(firmw
         until = time.monotonic() + PATIENCE
         while next_state(driver).safety_mode != 7:
             assert time.monotonic() < until
+
+
+@pytest.mark.parametrize(
+    ("status", "reasons"),
+    [
+        ("normal: [1]", ("fault", "fault")),
+        ("normal: [0, 1]", ("fault", "fault")),
+        ("normal: [0], values: {2: emergency_stop, 5: protective_stop}",
+         ("emergency_stop", "protective_stop")),
+        ("normal: [0], values: {2: emergency_stop}", ("emergency_stop", "fault")),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("shared", [False, True])
+def test_an_arm_simulated_from_its_map_reports_its_stops(
+    tmp_path: Path, status: str, reasons: tuple[str, str], shared: bool
+) -> None:
+    """``shared``: the same signal says whether the motors are enabled."""
+    text = INVENTED.read_text().replace("normal: [0], values: {2: emergency_stop}", status)
+    text = text.replace("Health.powered", "Health.alarm") if shared else text
+    (tmp_path / "arm.yaml").write_text(text)
+    shutil.copy(INVENTED.with_suffix(".dbc"), tmp_path)
+    settings = CanSettings(profile=str(tmp_path / "arm.yaml"), interface="virtual")
+    controller = make_controller(*simulated_arm(MODEL.arm, seed=5), period=0.004)
+    (node,) = make_servers(settings, "127.0.0.2", controller)
+    profile = node._profile
+    health = next(message for message in profile.incoming.values() if message.name == "Health")
+
+    def reported() -> object:
+        values = health.decode(node._encode(health, controller))
+        return health.checks[0].stop_reason(int(values["alarm"]))
+
+    assert shared or reported() is None
+    controller.emergency_stop()
+    assert reported() == reasons[0]
+    controller.release_emergency_stop()
+    controller.protective_stop()
+    assert reported() == reasons[1]
+
+
+def test_a_simulated_serial_adapter_leaves_somebody_elses_link_alone(tmp_path: Path) -> None:
+    channel = tmp_path / "by-id"
+    channel.symlink_to(tmp_path / "the real adapter")
+    settings = CanSettings(profile="piper", interface="slcan", channel=str(channel))
+    controller = make_controller(*simulated_arm(MODEL.arm, seed=5), period=0.004)
+    (node,) = make_servers(settings, "127.0.0.2", controller)
+    try:
+        with pytest.raises(InputError, match="by-id, expected a name that is free"):
+            node.open(controller, SYSTEM)
+    finally:
+        node.close()
+    assert channel.readlink() == tmp_path / "the real adapter"
