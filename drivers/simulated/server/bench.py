@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 
 HEAVIEST = 200.0  # kg
+FARTHEST = 10.0  # m, of a payload's centre of gravity
+STRONGEST = 1e4  # N, Nm
 LONGEST_LINE = 1000  # characters
 
 Joints = tuple[float, ...]
@@ -146,16 +148,19 @@ class BenchServer:
         mass, x, y, z = numbers
         if not 0.0 <= mass <= HEAVIEST:
             raise BenchError(f"payload: found {mass:g} kg, expected 0 to {HEAVIEST:g}")
+        _check_size("payload", (x, y, z), FARTHEST, "m")
         self._controller.plant.set_load(mass, (x, y, z))
 
     def _wrench(self, numbers: list[float]) -> None:
         fx, fy, fz, tx, ty, tz = numbers
+        _check_size("wrench", numbers, STRONGEST, "N or Nm")
         self._controller.plant.set_force((fx, fy, fz), (tx, ty, tz))
 
     def _slip(self, numbers: list[float]) -> None:
         plant, joint = self._controller.plant, numbers[0]
         if joint not in range(1, len(plant.q) + 1):
             raise BenchError(f"slip: found joint {joint:g}, expected 1 to {len(plant.q)}")
+        _check_size("slip", numbers[1:], math.pi, "rad")
         plant.slip(int(joint) - 1, numbers[1])
 
     # -- for scoring ------------------------------------------------------------------------------
@@ -202,6 +207,13 @@ def tcp_scatter(controller: BenchSubject) -> float:
         q = (*plant.q[:i], plant.q[i] + step, *plant.q[i + 1 :])
         total += (math.dist(tip(q).origin, here) / step * sigma) ** 2
     return math.sqrt(total)
+
+
+def _check_size(name: str, values: Sequence[float], most: float, unit: str) -> None:
+    """Refuse numbers beyond which the plant's equilibrium has no meaning, or no numbers."""
+    largest = max(values, key=abs)
+    if abs(largest) > most:
+        raise BenchError(f"{name}: found {largest:g} {unit}, expected at most {most:g}")
 
 
 def _numbers(name: str, arguments: list[str], count: int) -> list[float]:

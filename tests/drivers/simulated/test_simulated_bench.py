@@ -9,6 +9,9 @@ from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings
 from simulated_controller import SimulatedController
 
+from gapbridge.drivers.simulated.server.bench import BenchServer
+from gapbridge.drivers.simulated.ur.settings import make_controller
+
 
 def reader(host: str, names: str) -> RtdeClient:
     client = RtdeClient(host)
@@ -189,3 +192,26 @@ def test_a_mistake_on_the_bench_is_reported(bench: Bench, line: str, reason: str
     assert answer.startswith("error: ")
     assert reason in answer
     assert "measure" in bench.ask("help")
+
+
+@pytest.mark.parametrize(
+    ("line", "phrase"),
+    [
+        ("wrench 1e200 0 0 0 0 0", "wrench: found 1e+200 N or Nm, expected at most 10000"),
+        ("wrench 0 0 0 0 0 -20000", "wrench: found -20000 N or Nm, expected at most 10000"),
+        ("payload 1 0 1e300 0", "payload: found 1e+300 m, expected at most 10"),
+        ("slip 2 1e17", "slip: found 1e+17 rad, expected at most 3.14159"),
+    ],
+)
+def test_numbers_that_end_no_equilibrium_are_refused_and_the_controller_goes_on(
+    line: str, phrase: str
+) -> None:
+    controller = make_controller(cell_settings())
+    bench = BenchServer(controller, lambda: None, lambda _: None)
+    assert bench.answer(line) == f"error: {phrase}"
+    for _ in range(11):
+        controller.cycle()
+        controller.sensors.after_cycle(controller.clock)
+    assert bench.answer("payload 200 10 0 0") == bench.answer("slip 2 -3") == "ok"
+    assert bench.answer("wrench 1e4 0 0 0 0 1e4") == "ok"
+    assert np.isfinite([float(v) for v in bench.answer("measure").split(",")]).all()
