@@ -6,6 +6,7 @@ import pytest
 
 from gapbridge.bridge.document.notes import TEXTS, note_text
 from gapbridge.core.notes import Note, Reason
+from gapbridge.core.planning.candidates import RejectedPoses
 
 SAMPLES = {
     Note(Reason.SUM_KNOWN, ("a_1", "b_2", 0.991)):
@@ -25,6 +26,9 @@ SAMPLES = {
     Note(Reason.DETOURS, (tuple((i, i + 1) for i in range(1, 11)),)):
         "no straight path in joint space, make a detour: stops 1 to 2, 2 to 3, 3 to 4, 4 to 5, "
         "5 to 6, 6 to 7, 7 to 8, 8 to 9 and 2 more",
+    Note(Reason.FEW_POSES, (RejectedPoses(200, (("BOX", 2, 100), ("FLOOR", 0, 50))),)):
+        "few poses to choose from: of 200 random poses 50 % come into keep-out box 2, 25 % come "
+        "below the floor",
 }  # fmt: skip
 
 
