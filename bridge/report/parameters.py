@@ -100,7 +100,7 @@ def measurements_table(measurements: tuple[Measurement, ...], most: int) -> bloc
         ("joint angles (deg)", 2.6, [_degrees(m.q, 1) for m in shown]),
     ]
     if any(m.approach for m in shown):
-        columns.append(("reach each joint from", 1.2, [_approach(m) for m in shown]))
+        columns.append(("last motion of each joint", 1.2, [_approach(m) for m in shown]))
     if any(m.velocity for m in shown):
         columns.append(("in motion (deg/s; deg/s²)", 2.2, [_motion(m) for m in shown]))
     columns += [

@@ -14,7 +14,9 @@ from gapbridge.bridge.report import SECTIONS, report_text
 from gapbridge.bridge.report.answer import picture
 from gapbridge.bridge.report.labels import VERDICTS, joint_list, listed, quantity_title
 from gapbridge.bridge.report.material import SHOWN, shares, thinned, unexplained
+from gapbridge.bridge.report.parameters import measurements_table
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rpy_matrix, transform
@@ -36,6 +38,12 @@ def test_a_report_is_one_small_file_with_every_section(case):
     for section in SECTIONS:
         shown = section.key != "slips" or name == "slip"
         assert (f'<section id="{section.key}"><h2>{section.title}</h2>' in text) is shown
+
+
+def test_a_measurement_names_the_last_motion_of_each_joint():
+    wanted = Measurement((0.0,) * 3, 2.0, ("backlash",), 3.0, approach=(1, -1, 0))
+    table = measurements_table((wanted,), 1)
+    assert table.rows[0][table.heads.index("last motion of each joint")] == "+ − 0"
 
 
 def test_nothing_is_loaded_from_outside(case):
