@@ -6,9 +6,9 @@ import asyncio
 import hashlib
 import hmac
 import ipaddress
-from http.cookies import CookieError, SimpleCookie
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import cookie_parser
 from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -122,13 +122,9 @@ class Guard:
         assert self._token is not None and self._pass is not None
         scheme, _, token = headers.get("authorization", "").partition(" ")
         bearer = token.strip() if scheme.lower() == "bearer" else ""
-        cookies: SimpleCookie = SimpleCookie()
-        try:
-            cookies.load(headers.get("cookie", ""))
-        except CookieError:
-            cookies.clear()
-        cookie = cookies.get(cookie_name(self._settings))
-        shown = cookie.value if cookie is not None else ""
+        # the standard library's parser stops at an odd cookie of another server of this machine
+        cookies = cookie_parser(headers.get("cookie", ""))
+        shown = cookies.get(cookie_name(self._settings), "")
         # both are compared always, in constant time
         right = hmac.compare_digest(bearer.encode(), self._token)
         return hmac.compare_digest(shown.encode(), self._pass) or right

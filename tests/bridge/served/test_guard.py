@@ -86,3 +86,9 @@ def test_who_shows_nothing_or_the_right_thing_does_not_wait(delays: list[float])
     cookie = f"{cookie_name(ServedSettings())}={cookie_of(TOKEN.encode())}".encode()
     assert answer(HOST, (b"cookie", cookie), token=TOKEN) == 200
     assert delays == []
+
+
+@pytest.mark.parametrize("other", [b'view={"x":1,"y":2}', b"name=two words", b"flag", b"a[0]=1"])
+def test_odd_cookies_of_other_servers_of_the_machine_are_passed_over(other: bytes) -> None:
+    cookie = f"{cookie_name(ServedSettings())}={cookie_of(TOKEN.encode())}".encode()
+    assert answer(HOST, (b"cookie", other + b"; " + cookie), token=TOKEN) == 200
