@@ -84,12 +84,10 @@ def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
     n = model.arm.n
     free = np.arange(max(n - WRIST_JOINTS, 0), n)
     limits = model.arm.limits
-    low = np.maximum(
-        np.where(np.isfinite(limits.lower), limits.lower + LIMIT_MARGIN, -np.pi), -np.pi
-    )
-    high = np.minimum(
-        np.where(np.isfinite(limits.upper), limits.upper - LIMIT_MARGIN, np.pi), np.pi
-    )
+    # a joint that hardly turns, or not within half a turn of zero, stays at an allowed angle
+    margin = np.minimum(LIMIT_MARGIN, (limits.upper - limits.lower) / 2)
+    lower, upper = limits.lower + margin, limits.upper - margin
+    low, high = np.clip(-np.pi, lower, upper), np.clip(np.pi, lower, upper)
     candidates = np.tile(begin, (CANDIDATES, 1))
     candidates[1:, free] = rng.uniform(low[free], high[free], (CANDIDATES - 1, len(free)))
     return candidates

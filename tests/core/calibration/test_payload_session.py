@@ -144,3 +144,15 @@ def test_a_wrist_that_cannot_turn_is_reported_when_planning(model: Model) -> Non
     fixed = replace(model, arm=replace(model.arm, limits=limits))
     with pytest.raises(ExcitationError, match="cannot turn the flange far enough"):
         plan_payload(fixed, BEGIN)
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(-0.02, 0.02), (0.0, 0.09), (3.2, 6.0)])
+def test_a_wrist_joint_with_hardly_any_range_keeps_within_it(
+    model: Model, lower: float, upper: float
+) -> None:
+    low, high = model.arm.limits.lower.copy(), model.arm.limits.upper.copy()
+    low[5], high[5] = lower, upper
+    limits = replace(model.arm.limits, lower=low, upper=high)
+    plan = plan_payload(replace(model, arm=replace(model.arm, limits=limits)), BEGIN)
+    last = np.array(plan.poses)[:, 5]
+    assert ((last == BEGIN[5]) | ((last >= lower) & (last <= upper))).all()
