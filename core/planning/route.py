@@ -67,26 +67,30 @@ def plan_route(
     counts = _repeats_per_block(
         [sum(not stop.held_out for stop in block) for block in blocks], repeats
     )
-    previous, travel = None, 0.0
+    previous: Array | None = None
+    travel = 0.0
     ordered: list[Visit] = []
-    blocked_legs: list[tuple[int, int]] = []
+    detours: list[tuple[int, int]] = []  # stops from 1
     for block, repeated in zip(blocks, counts, strict=True):
-        q = readings.q[[stop.row for stop in block]]
-        legs, blocked = _legs_between(q, workspace, speed)
-        first = np.zeros(len(q)) if previous is None else move_times(previous[None], q, speed)[0]
-        order = shortest_order(np.where(blocked, COLLISION_FACTOR * legs + 1.0, legs), first)
+        count, q = len(block), readings.q[[stop.row for stop in block]]
+        # the last stop before the block is the last row
+        known = q if previous is None else np.vstack([q, previous])
+        legs, blocked = _legs_between(known, workspace, speed)
+        cost = np.where(blocked, COLLISION_FACTOR * legs + 1.0, legs)
+        first = np.zeros(count) if previous is None else cost[count, :count]
+        order = shortest_order(cost[:count, :count], first)
         visits = [block[i] for i in order]
         fitted = [i for i in order if not block[i].held_out]
         order += [fitted[i] for i in _repeat_indices(len(fitted), repeated)]
-        for step, (a, b) in enumerate(pairwise(order)):
+        begin = [] if previous is None else [count]
+        for stop, (a, b) in enumerate(pairwise(begin + order), len(ordered) + 1 - len(begin)):
             travel += float(legs[a, b])
             if blocked[a, b]:
-                blocked_legs.append((len(ordered) + step, len(ordered) + step + 1))
-        travel += float(first[order[0]])
-        ordered += visits + [replace(block[i], repeat=1) for i in order[len(visits) :]]
+                detours.append((stop, stop + 1))
+        ordered += visits + [replace(block[i], repeat=1) for i in order[count:]]
         previous = q[order[-1]]
-    pairs = tuple((a + 1, b + 1) for a, b in blocked_legs)
-    return Route(tuple(ordered), travel, (Note(Reason.DETOURS, (pairs,)),) if pairs else ())
+    notes = (Note(Reason.DETOURS, (tuple(detours),)),) if detours else ()
+    return Route(tuple(ordered), travel, notes)
 
 
 def _repeats_per_block(fitted: list[int], repeats: int) -> list[int]:

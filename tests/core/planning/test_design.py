@@ -33,6 +33,7 @@ from gapbridge.core.planning.exchange import (
     forward_selected,
 )
 from gapbridge.core.planning.information import information_of, inverse, whitened_rows
+from gapbridge.core.planning.route import Visit, plan_route
 from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 
@@ -87,6 +88,20 @@ def test_loads_are_hung_once_and_each_block_ends_where_it_began(planned: Plan) -
 def test_held_out_poses_are_poses_of_their_own(planned: Plan) -> None:
     fitted = {p.q.tobytes() for p in planned.poses if not p.held_out}
     assert not fitted & {p.q.tobytes() for p in planned.poses if p.held_out}
+
+
+def test_a_detour_to_the_first_pose_with_the_next_load_is_noted(
+    parameters: Parameters, space: Workspace
+) -> None:
+    found = sample_candidates(parameters, POSITION, LOADS, space, 1, 30)
+    shares = np.linspace(0, 1, 11)[1:-1, None]
+    there = next(
+        there
+        for there in range(1, 30)
+        if not space.clear(found.q[0] + shares * (found.q[there] - found.q[0])).all()
+    )
+    stops = [Visit(0), Visit(30 + there)]  # the second under the other load
+    assert plan_route(found, stops, space, 0).notes == (Note(Reason.DETOURS, (((1, 2),),)),)
 
 
 def test_every_planned_pose_can_be_reached_and_seen(planned: Plan, space: Workspace) -> None:
