@@ -63,6 +63,7 @@ class Reason(Enum):
     SIGHT_UNKNOWN = auto()
     DETOURS = auto()  # pairs of stops, from 1
     FEW_POSES = auto()  # RejectedPoses
+    FEW_HELD_OUT = auto()  # held-out poses, of how many
     # of a recording that is read as a log
     NO_STAMPS = auto()  # topic, messages without a stamp, messages
     NO_TARGET = auto()

@@ -80,6 +80,7 @@ TEXTS = {
     Reason.SIGHT_UNKNOWN: "the instrument's place is unknown: its line of sight was not checked",
     Reason.DETOURS: "no straight path in joint space, make a detour: stops {0:ways}",
     Reason.FEW_POSES: "few poses to choose from: {0:rejected}",
+    Reason.FEW_HELD_OUT: "{0} of {1} held-out poses are planned: the fit uses the others",
     Reason.NO_STAMPS: "{0}: {1} of {2} messages have no stamp in their header; the time of "
     "recording is used instead",
     Reason.NO_TARGET: "target_q: no topic has it, so that tracking cannot be observed",

@@ -132,7 +132,9 @@ def _planned(
     used_loads = set(candidates.readings.load[len(rows) :])
     sight = () if workspace.places or observable.unknown else (Note(Reason.SIGHT_UNKNOWN),)
     warnings = _notes(parameters, loads, used_loads, expected.std)
-    notes = (*candidates.notes, *sight, *route.notes, *warnings)
+    held_out = (len(checks), design.held_out)
+    few = (Note(Reason.FEW_HELD_OUT, held_out),) if len(checks) < design.held_out else ()
+    notes = (*candidates.notes, *few, *sight, *route.notes, *warnings)
     accuracy = tuple(sorted(std_of.items()))
     return Plan(tuple(loads), route.poses(candidates), expected, accuracy, route.travel, notes)
 
@@ -181,10 +183,13 @@ def _require_enough(
     parameters: Parameters, observable: Observable, candidates: Candidates, design: SessionDesign
 ) -> None:
     _require(len(parameters) + observable.layout(candidates.readings).size, observable, design)
-    if len(candidates.readings) < design.poses + design.held_out:
+    found = len(candidates.q)
+    each = len(candidates.readings) // found  # loads and approaches
+    needed = -(-design.poses // each) + design.held_out  # no held-out pose is fitted
+    if found < needed:
         raise PlanError(
-            f"poses: {len(candidates.readings)} are reachable and visible, expected at least "
-            f"{design.poses + design.held_out}; {candidates.rejected}"
+            f"poses: {found} are reachable and visible, expected at least {needed}; "
+            f"{candidates.rejected}"
         )
 
 
@@ -269,7 +274,8 @@ def _held_out(candidates: Candidates, chosen: list[int], design: SessionDesign) 
     used = set(candidates.stop[chosen])
     loads = np.unique(candidates.readings.load[chosen])
     picked: list[int] = []
-    for row in random.permutation(len(candidates.readings)):
+    # a row that is passed over for its load may be wanted next
+    for row in np.tile(random.permutation(len(candidates.readings)), design.held_out):
         wanted = loads[len(picked) % len(loads)]
         if len(picked) == design.held_out:
             break

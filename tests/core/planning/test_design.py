@@ -90,6 +90,23 @@ def test_held_out_poses_are_poses_of_their_own(planned: Plan) -> None:
     assert not fitted & {p.q.tobytes() for p in planned.poses if p.held_out}
 
 
+def test_as_many_poses_are_held_out_as_the_fit_leaves(
+    parameters: Parameters, space: Workspace
+) -> None:
+    asked = {"poses": 8, "repeats": 0, "seed": 1}
+    planned = plan(parameters, POSITION, LOADS, space, held_out=4, stops=12, **asked)
+    assert sum(p.held_out for p in planned.poses) == 4
+    assert not [note for note in planned.notes if note.reason is Reason.FEW_HELD_OUT]
+    planned = plan(parameters, POSITION, LOADS, space, held_out=7, stops=12, **asked)
+    left = sum(p.held_out for p in planned.poses)
+    assert left == 12 - len({p.q.tobytes() for p in planned.poses if not p.held_out})
+    assert left < 7 and Note(Reason.FEW_HELD_OUT, (left, 7)) in planned.notes
+    with pytest.raises(
+        PlanError, match="poses: 12 are reachable and visible, expected at least 13"
+    ):
+        plan(parameters, POSITION, LOADS, space, held_out=9, stops=12, **asked)
+
+
 def test_a_detour_to_the_first_pose_with_the_next_load_is_noted(
     parameters: Parameters, space: Workspace
 ) -> None:
