@@ -17,7 +17,7 @@ class ServedSettings(Section):
     """Address and credentials of a server; beyond loopback it needs TLS and a token."""
 
     host: str = Field("127.0.0.1", description="an address of this machine, or localhost")
-    port: int = Field(0, ge=0, le=65535, description="TCP port; 0: any that is free")
+    port: int = Field(0, ge=0, le=65535, description="TCP port")
     certificate: Path | None = Field(None, description="TLS: certificate chain, PEM")
     key: Path | None = Field(None, description="TLS: private key, PEM")
     token_file: Path | None = Field(

@@ -13,13 +13,13 @@ WEB_PORT = 30380
 class MetricsSettings(ServedSettings):
     """Prometheus metrics; a cell without this section has none."""
 
-    port: int = Field(METRICS_PORT, ge=0, le=65535, description="TCP port; 0: any that is free")
+    port: int = Field(METRICS_PORT, ge=1, le=65535, description="TCP port")
 
 
 class WebSettings(ServedSettings):
     """The status page; a cell without this section has none."""
 
-    port: int = Field(WEB_PORT, ge=0, le=65535, description="TCP port; 0: any that is free")
+    port: int = Field(WEB_PORT, ge=1, le=65535, description="TCP port")
     clients: int = Field(
         16, ge=1, le=1000, description="largest number of pages open at the same time"
     )

@@ -147,6 +147,8 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
         ("robot: {dh: []}", "no rows", "one row"),
         ("robot: {dh: [{a: 1, alpha: 0}]}", "robot.dh entry 1.d: found nothing", "expected m"),
         (ARM + "setpoints: {file: 5}", "setpoints.file: found 5", "expected a path"),
+        (ARM + "web: {port: 0}", "web.port: found 0", "expected 1 or more"),
+        (ARM + "metrics: {port: 0}", "metrics.port: found 0", "expected 1 or more"),
         ("robot: {dh: [{a: 1, alpha: 0, d: x}]}", "'x'", "a number"),
         ("robot: {urdf: none.urdf}", "none.urdf", "URDF"),
         (f"robot: {{urdf: {'x' * 300}}}", "file not found", "URDF"),
