@@ -17,7 +17,7 @@ def is_date(time: float) -> bool:
 def clock(time: float, dated: bool = False) -> str:
     """Return seconds since 1970 as local time of day, ``dated`` with its date; else seconds."""
     if not is_date(time):
-        return f"{time:.7g} s"
+        return f"{round(time, 4):.15g} s"  # also weeks after a controller's start
     return datetime.fromtimestamp(time).strftime(f"{DAY} {TIME}" if dated else TIME)
 
 

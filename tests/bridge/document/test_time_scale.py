@@ -82,6 +82,13 @@ def test_joined_clocks_have_no_times_of_day() -> None:
     assert (axis.title, axis.labels[1]) == ("s from the first row", "2000")
 
 
+@pytest.mark.parametrize(
+    ("time", "text"), [(730.0, "730 s"), (12346408.25, "12346408.25 s"), (0.1 + 0.2, "0.3 s")]
+)
+def test_seconds_are_exact_also_months_after_a_controllers_start(time: float, text: str) -> None:
+    assert clock(time) == text
+
+
 def test_times_are_local_and_name_their_zone(in_zone) -> None:
     in_zone("Asia/Kolkata")
     assert clock(START) == "06:23:20"
