@@ -29,6 +29,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.document.output_file import printable
 from gapbridge.bridge.ipc.cycle_counts import CycleCounts
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import DROPPED
@@ -186,8 +187,8 @@ class Families(Collector):
         configuration = str(self._counts.status.get("configuration_hash", ""))
         settings = self._counts.settings
         family.add_metric([], {
-            "session": self._session, "cell": settings.cell.stem, "driver": settings.link.driver,
-            "configuration_hash": configuration,
+            "session": self._session, "cell": printable(settings.cell.stem),
+            "driver": settings.link.driver, "configuration_hash": configuration,
         })  # fmt: skip
         return family
 

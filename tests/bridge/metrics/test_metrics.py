@@ -10,12 +10,16 @@ import httpx
 import numpy as np
 import pytest
 from patience import PATIENCE, wait_for
+from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as strict_parser
 from prometheus_client.parser import text_string_to_metric_families
 from watched_feed import Feed
 
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.loop_state import State
-from gapbridge.bridge.metrics.main import Buckets, recording_lag
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
+from gapbridge.bridge.metrics.main import Buckets, Counts, Families, recording_lag
+from gapbridge.drivers.clock import SYSTEM
 
 
 @pytest.fixture(scope="module")
@@ -162,9 +166,21 @@ def test_a_histogram_is_cumulative_and_ends_with_all_values():
     assert buckets.sum == pytest.approx(7.0065)
 
 
+def test_a_cell_whose_name_is_no_text_is_counted_too():
+    settings = DaemonSettings.model_validate(
+        {
+            "cell": os.fsdecode(b"zelle_\xfc.yaml"),
+            "link": {"driver": "ur_rtde", "host": "127.0.0.2"},
+        }
+    )
+    registry = CollectorRegistry(auto_describe=False)
+    counts = Counts(SharedMemory(6, clock=SYSTEM), settings, SYSTEM)
+    registry.register(Families("run", counts, {}))
+    assert b'cell="zelle_\\\\udcfc"' in generate_latest(registry)
+
+
 def test_the_names_are_also_good_openmetrics(feed):
     from prometheus_client.openmetrics.exposition import generate_latest
-    from prometheus_client.registry import CollectorRegistry
 
     class Again:
         def collect(self):
