@@ -267,8 +267,8 @@ class History:
             points = points[points[:, 0] > points[-1, 0] - seconds]
         if len(points) <= most:
             return points
-        length = seconds / most
-        return thinned(points, np.floor(points[:, 0] / length))
+        slot = np.floor((points[-1, 0] - points[:, 0]) * most / seconds)
+        return thinned(points, np.minimum(slot, most - 1))
 
 
 def thinned(cycles: Array, slot: Array) -> Array:
