@@ -8,12 +8,18 @@ import socket
 import ssl
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import uvicorn
 from starlette.types import ASGIApp
 
 from gapbridge.bridge.served.credentials import tls_context
-from gapbridge.bridge.served.protocol import LARGEST_HEAD, MOST_CONNECTIONS, GuardedProtocol
+from gapbridge.bridge.served.protocol import (
+    HEADER_TIME,
+    LARGEST_HEAD,
+    MOST_CONNECTIONS,
+    GuardedProtocol,
+)
 from gapbridge.bridge.served.settings import ServedSettings
 from gapbridge.core.errors import LinkError
 
@@ -30,6 +36,17 @@ class _Config(uvicorn.Config):
     def load(self) -> None:
         super().load()
         self.ssl = self.context
+
+
+class _Loop(asyncio.SelectorEventLoop):
+    """An event loop that waits for a TLS handshake as long as for a head, not a minute."""
+
+    handshake_time = HEADER_TIME
+
+    async def create_server(self, *arguments: Any, **keys: Any) -> asyncio.Server:
+        if keys.get("ssl") is not None:
+            keys["ssl_handshake_timeout"] = self.handshake_time
+        return await super().create_server(*arguments, **keys)
 
 
 def listen(settings: ServedSettings) -> socket.socket:
@@ -74,7 +91,8 @@ def serve(
         config.context = context
         # refused requests are counted, not logged
         logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
-        asyncio.run(_serve(uvicorn.Server(config), listener, over, update, every))
+        with asyncio.Runner(loop_factory=_Loop) as runner:
+            runner.run(_serve(uvicorn.Server(config), listener, over, update, every))
 
 
 async def _serve(

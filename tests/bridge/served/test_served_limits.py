@@ -3,14 +3,18 @@
 import asyncio
 import contextlib
 import socket
+import ssl
 import threading
 import time
 
 import httpx
 import pytest
-from patience import PATIENCE
+from patience import PATIENCE, wait_for
 from ports import free_port
+from starlette.responses import PlainTextResponse
+from watched_feed import self_signed
 
+from gapbridge.bridge.served import server
 from gapbridge.bridge.served.protocol import GuardedProtocol
 from gapbridge.bridge.served.server import listen, serve
 from gapbridge.bridge.served.settings import ServedSettings
@@ -85,6 +89,34 @@ def _rest(link):
         while piece := link.recv(1 << 20):
             taken += len(piece)
     return taken
+
+
+def test_a_tls_handshake_that_does_not_come_is_cut_off(tmp_path, monkeypatch):
+    monkeypatch.setattr(server._Loop, "handshake_time", 0.2)
+    certificate, key = self_signed(tmp_path)
+    settings = ServedSettings(port=free_port(), certificate=certificate, key=key)
+    over = threading.Event()
+    app = PlainTextResponse("fine")
+    thread = threading.Thread(
+        target=serve, args=(app, settings, "web", over.is_set, lambda: None, 0.05)
+    )
+    thread.start()
+    links = []
+
+    def connected():
+        with contextlib.suppress(ConnectionRefusedError):
+            links.append(socket.create_connection(("127.0.0.1", settings.port), timeout=PATIENCE))
+        return links
+
+    try:
+        wait_for(connected, "the server")
+        with links[0] as link:
+            assert link.recv(1) == b""
+        context = ssl.create_default_context(cafile=str(certificate))
+        assert httpx.get(settings.url, verify=context).text == "fine"
+    finally:
+        over.set()
+        thread.join(PATIENCE)
 
 
 def test_an_address_that_is_taken_is_reported_in_one_line():
