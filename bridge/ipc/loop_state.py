@@ -19,3 +19,11 @@ class State(IntEnum):
     def writes(self) -> bool:
         """Return whether setpoints are sent in this state."""
         return self in (State.COMPENSATING, State.HOLDING)
+
+
+def has_link(named: object) -> bool:
+    """Return whether a status document's state is one with a link.
+
+    Without one it is disconnected, or a text while the loop compiles.
+    """
+    return named in {state.name.lower() for state in State if state != State.DISCONNECTED}

@@ -33,7 +33,7 @@ from gapbridge.bridge.document.output_file import printable
 from gapbridge.bridge.ipc.cycle_counts import CycleCounts
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import DROPPED
-from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.bridge.ipc.loop_state import State, has_link
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import StartData, run_side
 from gapbridge.bridge.ipc.updated_settings import UpdatedSettings
@@ -101,6 +101,13 @@ class Counts:
     def settings(self) -> DaemonSettings:
         """Return the present settings of the run."""
         return self._updated.settings
+
+    @property
+    def state(self) -> State:
+        """Return the supervisor's state; disconnected where its process has ended in another."""
+        if self.status and not has_link(self.status.get("state")):
+            return State.DISCONNECTED
+        return State(self.memory.state)
 
     @property
     def silence(self) -> float:
@@ -196,8 +203,9 @@ class Families(Collector):
         family = GaugeMetricFamily(
             "gapbridge_state", "1 for the state that the supervisor is in.", labels=["state"]
         )
+        present = self._counts.state
         for state in State:
-            family.add_metric([state.name.lower()], float(self._counts.memory.state == state))
+            family.add_metric([state.name.lower()], float(state == present))
         return family
 
     def _cycles(self) -> Iterator[Metric]:

@@ -14,7 +14,7 @@ import numpy as np
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.cycle_counts import CycleCounts
 from gapbridge.bridge.ipc.events import EventKind
-from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.bridge.ipc.loop_state import State, has_link
 from gapbridge.bridge.ipc.shared_memory import ROWS, SharedMemory
 from gapbridge.bridge.ipc.updated_settings import UpdatedSettings
 from gapbridge.bridge.web.prediction import Prediction
@@ -68,6 +68,7 @@ class PageData:
         self._timing_at = self._arm_at = 0.0
         self._row: Array | None = None  # the last cycle
         self._down = False  # the loop has ended and no other is connected
+        self._no_loop = False  # the same, by the status: the end was before this process began
         self._times = np.empty(0)  # s, monotonic, of the last cycles
         self.events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
         self.status: dict[str, Any] = {}
@@ -104,10 +105,11 @@ class PageData:
     def _on_event(self, event: dict[str, Any]) -> list[Message]:
         if event.get("kind") == EventKind.STATUS:
             self.status = event
+            self._no_loop = "state" in event and not has_link(event["state"])
             return [("status", event)]
         if "to" in event:
             self._why = event
-            self._down = event["to"] == State.DISCONNECTED.name
+            self._down, self._no_loop = event["to"] == State.DISCONNECTED.name, False
         elif event.get("kind") in ENDS:
             # since when it is down is the first end's time; why, the newest one's
             since = self._why["time"] if self._down else event["time"]
@@ -147,9 +149,10 @@ class PageData:
         silence = now - self._last if self._last else None
         alive = len(times) > 1 and silence is not None and silence < RATE_SPAN
         rate = (len(times) - 1) / (times[-1] - times[0]) if alive else 0.0
+        state = State.DISCONNECTED if self._down or self._no_loop else State(self._memory.state)
         return {
             "time": self._clock.time(),
-            "state": (State.DISCONNECTED if self._down else State(self._memory.state)).name.lower(),
+            "state": state.name.lower(),
             "phase": self._memory.phase.name.lower(),
             "why": {k: v for k, v in self._why.items() if k in ("cause", "detail", "time")},
             "silence": silence,  # s since the last state of the robot
