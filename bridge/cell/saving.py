@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from gapbridge.bridge.cell.cell import Cell
+from gapbridge.bridge.cell.cell import Cell, cell_of
 from gapbridge.bridge.cell.document import number_text, parse
 from gapbridge.bridge.cell.effects import compliance_entry, effect_entries
-from gapbridge.bridge.document.output_file import write_text
-from gapbridge.core.errors import CellError
+from gapbridge.bridge.document.output_file import replacing
+from gapbridge.core.errors import CellError, InputError, RunError
 from gapbridge.core.files import Document
 from gapbridge.core.model import Model
 
@@ -46,9 +46,12 @@ def save_cell(
 
     Keys, order and comments of the user's file are kept; relative paths are rewritten for the new
     file's folder. Reading the new file gives exactly the same model.
+
+    Raises RunError where the new cell could not be loaded, or not be written; nothing is written.
     """
     path = Path(path)
-    write_text(path, cell_text(cell, path, model or cell.model, sections))
+    with replacing(path) as file:
+        file.write(cell_text(cell, path, model or cell.model, sections))
 
 
 def _changed_tool(cell: Cell, model: Model) -> dict[str, Any]:
@@ -62,7 +65,19 @@ def _changed_tool(cell: Cell, model: Model) -> dict[str, Any]:
 
 
 def cell_text(cell: Cell, path: Path, model: Model, sections: dict[str, Any] | None = None) -> str:
-    """Return the text of the cell file at ``path`` for ``model``; see save_cell."""
+    """Return the text of the cell file at ``path`` for ``model``; see save_cell.
+
+    Raises RunError where the cell could not be loaded.
+    """
+    text = _text(cell, path, model, sections)
+    try:
+        cell_of(text, path)
+    except InputError as error:
+        raise RunError(f"nothing is written, the cell could not be loaded: {error}") from None
+    return text
+
+
+def _text(cell: Cell, path: Path, model: Model, sections: dict[str, Any] | None) -> str:
     document = cell.document
     changes: dict[str, Any] = _changed_tool(cell, model) | (sections or {})
     changes["compliance"] = compliance_entry(model.terms, model.arm.n)

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.cell import load_cell, save_cell
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.saving import cell_text
 from gapbridge.bridge.document.numbers import with_unit
 from gapbridge.bridge.document.output_file import write_text, write_together
 from gapbridge.bridge.document.provenance import fitted, intervals_of, provenance
@@ -157,12 +158,14 @@ def _drift_and_outlier_lines(summary: FleetDiagnosis | FleetFit) -> list[str]:
 def write_cells(fit: FleetFit, folder: Path) -> list[Path]:
     """Write a cell per arm and the table of them; returns the paths, the table last.
 
-    Each is the cell of the arm's last session; flexibilities not identified are kept.
+    Each is the cell of the arm's last session; flexibilities not identified are kept. Raises
+    RunError, before the first is written, where one could not be loaded.
     """
     arms = [(kind, arm) for kind in fit.types for arm in kind.arms]
     paths = cell_paths(folder, [arm.name for _, arm in arms])
-    for (kind, arm), path in zip(arms, paths, strict=True):
-        _write_cell(kind, arm, path)
+    texts = [_cell_text(kind, arm, path) for (kind, arm), path in zip(arms, paths, strict=True)]
+    for path, cell in zip(paths, texts, strict=True):
+        write_text(path, cell)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(("arm", "cell"))
@@ -191,7 +194,7 @@ def require_no_input(folder: Path, arms: Sequence[str], inputs: Iterable[Path]) 
             )
 
 
-def _write_cell(kind: FittedType, arm: FittedArm, path: Path) -> None:
+def _cell_text(kind: FittedType, arm: FittedArm, path: Path) -> str:
     last, known = arm.sessions[-1].outcome, kind.scatter.identifiable
     cell = load_cell(Path(last.cell))
     values = np.where(known, arm.fit.flexibility, flexibilities(cell.model))
@@ -204,7 +207,7 @@ def _write_cell(kind: FittedType, arm: FittedArm, path: Path) -> None:
     origin = provenance({"log": logs, "cell": [Path(last.cell)]})
     origin = fitted(origin, ranges, spread, cell.intervals | intervals)
     model = cell.model.with_compliance(values[:n], values[n:])
-    save_cell(cell, path, model, {"provenance": origin})
+    return cell_text(cell, path, model, {"provenance": origin})
 
 
 def _file_name(arm: str, used: set[str]) -> str:

@@ -19,7 +19,6 @@ from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cell.cell import cell_of
 from gapbridge.bridge.cell.saving import cell_text
 from gapbridge.bridge.cell.verification_mark import remove_mark
 from gapbridge.bridge.document.notes import note_text, short_text
@@ -30,7 +29,6 @@ from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.tool_session import ToolCalibration
-from gapbridge.core.errors import InputError, RunError
 from gapbridge.core.log.columns import as_table
 from gapbridge.core.model import Model
 
@@ -123,10 +121,6 @@ class Job(ABC):
             kept_keys = {"fitted", "parameters", "covariance"}
             origin |= kept.model_dump(mode="json", include=kept_keys)
         text = cell_text(cell, target, model, {"provenance": origin} | (sections or {}))
-        try:
-            cell_of(text, target)
-        except InputError as error:
-            raise RunError(f"nothing is written, the cell could not be loaded: {error}") from None
         # the baseline first: were only it replaced, the old cell would fail its verification
         beside = {} if baseline is None else {baseline_path(target): document_text(baseline)}
         write_together({**beside, target: text})

@@ -199,6 +199,17 @@ def test_a_cell_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["arm.urdf", "cell.yaml", "new.yaml"]
 
 
+def test_a_cell_that_could_not_be_loaded_is_not_written(tmp_path: Path) -> None:
+    cell = load_cell(cell_in(tmp_path))
+    target = tmp_path / "new.yaml"
+    target.write_text("the old one\n")
+    limp = cell.model.with_compliance([2.0] * 7, [0.0] * 7)
+    with pytest.raises(RunError, match=r"nothing is written.*compliance.axial entry 1: found 2"):
+        save_cell(cell, target, limp)
+    assert target.read_text() == "the old one\n"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["arm.urdf", "cell.yaml", "new.yaml"]
+
+
 @settings(max_examples=200, deadline=None)
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_every_number_reads_back_exactly(value: float) -> None:
