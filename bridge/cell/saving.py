@@ -18,7 +18,7 @@ from gapbridge.bridge.cell.document import number_text, parse
 from gapbridge.bridge.cell.effects import compliance_entry, effect_entries
 from gapbridge.bridge.document.output_file import replacing
 from gapbridge.core.errors import CellError, InputError, RunError
-from gapbridge.core.files import Document
+from gapbridge.core.files import Document, loaders
 from gapbridge.core.model import Model
 
 PLAIN = re.compile(r"(?!(?:y|n|yes|no|on|off|true|false|null|nan|inf)$)[a-z][a-z_]*", re.IGNORECASE)
@@ -35,6 +35,9 @@ class _Dumper(yaml.SafeDumper):
 _Dumper.add_representer(
     float, lambda d, value: d.represent_scalar("tag:yaml.org,2002:float", number_text(value))
 )
+for _first, _resolvers in loaders()[-1].yaml_implicit_resolvers.items():
+    for _tag, _pattern in _resolvers:  # 1e5 as a text: quoted, since cells are read as YAML 1.2
+        _Dumper.add_implicit_resolver(_tag, _pattern, [_first])
 
 
 def save_cell(
@@ -116,7 +119,7 @@ def _edited(
     for keys, moved in paths.items():
         node = document.node(keys)
         if isinstance(node, yaml.ScalarNode):
-            scalar = yaml.safe_dump(moved, width=10**6).split("\n")[0]
+            scalar = yaml.dump(moved, Dumper=_Dumper, width=10**6).split("\n")[0]
             edits.add((node.start_mark.index, node.end_mark.index, scalar))
     appended = ""
     for key, value in changes.items():

@@ -199,6 +199,14 @@ def test_a_cell_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["arm.urdf", "cell.yaml", "new.yaml"]
 
 
+def test_a_text_of_digits_stays_a_text(tmp_path: Path) -> None:
+    text = '{robot: {urdf: arm.urdf}, calibration: {serial: "2024e5", folder: "../1e5"}}\n'
+    cell = load_cell(cell_in(tmp_path / "c", text))
+    save_cell(cell, tmp_path / "new.yaml")
+    again = load_cell(tmp_path / "new.yaml").file.calibration
+    assert (again.serial, str(again.folder)) == ("2024e5", "1e5")
+
+
 def test_a_cell_that_could_not_be_loaded_is_not_written(tmp_path: Path) -> None:
     cell = load_cell(cell_in(tmp_path))
     target = tmp_path / "new.yaml"
