@@ -11,7 +11,8 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
-from gapbridge.core.log.columns import COLUMNS, is_known
+from gapbridge.core.log.columns import INDEXED, wanted_of
+from gapbridge.core.log.log import table_columns
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 from gapbridge.core.notes import Note, Reason
 
@@ -19,7 +20,7 @@ FRANKA = {  # libfranka's logToCSV -> the log's columns
     "state.q_d": "target_q", "state.q": "actual_q", "state.dq": "actual_qd",
     "state.tau_J": "actual_current_as_torque",
 }  # fmt: skip
-ELEMENT = re.compile(r"(.+?)(?:\[(\d+)\]|_(\d+))$")
+ELEMENT = re.compile(r"(.+)\[(\d+)\]")
 
 
 class Libfranka(Source):
@@ -34,8 +35,11 @@ class Libfranka(Source):
 
     def read(self, path: Path, arm_joints: Sequence[str], options: SourceOptions) -> Converted:
         """Return the log; see ``Source.read``."""
-        columns = _vectors(path, ",", FRANKA)
-        columns["timestamp"] = _column(path, ",", "time") * 1e-3
+        names = [_log_name(name) for name in _header(path, ",")]
+        columns = _columns(path, ",", names, len(arm_joints))
+        if "timestamp" not in columns:
+            raise LogError(f"{path}: column time: not found, expected it (ms)")
+        columns["timestamp"] *= 1e-3
         n = columns["actual_q"].shape[1]
         joints = tuple(f"joint{i + 1}" for i in range(n))
         return Converted(columns, joints, (Note(Reason.BEHIND_GEARS),))
@@ -55,9 +59,7 @@ class UrRecorder(Source):
 
     def read(self, path: Path, arm_joints: Sequence[str], options: SourceOptions) -> Converted:
         """Return the log; see ``Source.read``."""
-        columns = _vectors(path, None, {name: name for name in COLUMNS})
-        for name in (name for name in _header(path, None) if COLUMNS.get(name) == 0):
-            columns[name] = _column(path, None, name)
+        columns = _columns(path, None, _header(path, None), len(arm_joints))
         n = columns.get("actual_q", columns.get("target_q", np.empty((0, 0)))).shape[1]
         return Converted(columns, tuple(f"joint_{i + 1}" for i in range(n)))
 
@@ -73,24 +75,24 @@ def _header(path: Path, delimiter: str | None) -> list[str]:
         return []
 
 
-def _column(path: Path, delimiter: str | None, name: str) -> Array:
-    return _numbers(path, delimiter, [_header(path, delimiter).index(name)])[:, 0]
+def _log_name(name: str) -> str:
+    """Return the log's name of a column of libfranka's, '' where it has none."""
+    match = ELEMENT.fullmatch(name)
+    if match and match[1] in FRANKA:
+        return f"{FRANKA[match[1]]}_{match[2]}"
+    return "timestamp" if name == "time" else ""
 
 
-def _vectors(path: Path, delimiter: str | None, wanted: dict[str, str]) -> dict[str, Array]:
-    """Return the vectors (N, k) among the columns, under their new names."""
-    places: dict[str, dict[int, int]] = {}
-    for place, name in enumerate(_header(path, delimiter)):
-        match = ELEMENT.fullmatch(name)
-        if match and match[1] in wanted and (match[2] is not None or is_known(name)):
-            places.setdefault(wanted[match[1]], {})[int(match[2] or match[3])] = place
-    found = {}
-    for name, by_index in places.items():
-        if sorted(by_index) != list(range(len(by_index))):
-            raise LogError(f"{path}: column {name}: found indices {sorted(by_index)}, expected "
-                           f"0..{len(by_index) - 1}")  # fmt: skip
-        found[name] = _numbers(path, delimiter, [by_index[i] for i in sorted(by_index)])
-    return found
+def _columns(path: Path, delimiter: str | None, names: Sequence[str], n: int) -> dict[str, Array]:
+    """Return what of a file is a log's; ``names``: of all its columns, as a log has them.
+
+    ``n``: joints, 0 where the file is to say it. Raises LogError as ``grouped`` does.
+    """
+    places = wanted_of(names)
+    known = [names[i] for i in places]
+    matches = [INDEXED.fullmatch(name) for name in known]
+    joints = n or max(int(m[2]) + 1 for m in matches if m and m[1] in ("actual_q", "target_q"))
+    return table_columns(path, known, _numbers(path, delimiter, places), joints)
 
 
 def _numbers(path: Path, delimiter: str | None, places: list[int]) -> Array:

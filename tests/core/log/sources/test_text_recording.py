@@ -68,3 +68,28 @@ def test_a_header_alone_is_refused(tmp_path: Path, recwarn: pytest.WarningsRecor
     with pytest.raises(LogError, match=r"log\.csv: found no rows below the header"):
         source_of(tmp_path / "log.csv").read(tmp_path / "log.csv", (), SourceOptions())
     assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    ("extra", "found"),
+    [
+        ("payload_cog_0 payload_cog_1", "column payload_cog_2: not found"),
+        ("actual_TCP_force_0", "column actual_TCP_force_1: not found"),
+        ("target_q_0 target_q_1", "column target_q_2: not found"),
+        ("joint_temperatures_6", "column joint_temperatures_0: not found"),
+        ("actual_q_5", "column actual_q_5: found twice"),
+    ],
+)
+def test_a_vector_that_is_not_whole_is_refused(tmp_path: Path, extra: str, found: str) -> None:
+    path = tmp_path / "robot.txt"
+    names = [*(f"actual_q_{i}" for i in range(6)), *extra.split()]
+    path.write_text(" ".join(names) + "\n" + " ".join(["0.5"] * len(names)) + "\n")
+    with pytest.raises(LogError, match=rf"robot\.txt: {found}"):
+        source_of(path).read(path, (), SourceOptions())
+
+
+def test_a_franka_log_has_to_have_its_times(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("state.q[0],state.q[1]\n0.1,0.2\n")
+    with pytest.raises(LogError, match=r"log\.csv: column time: not found, expected it \(ms\)"):
+        source_of(path).read(path, (), SourceOptions())
