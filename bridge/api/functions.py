@@ -44,6 +44,7 @@ def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
     standard deviation comes from the covariance of what was fitted, where the cell has it.
     ``channels``: torque, wrench and tracking are predicted too.
     """
+    _require_arm(cell, log)
     q, loads = log.require("actual_q", "target_q"), log.loads(by_approach(cell.model.terms))
     spread, ranges, std = cell.spread, cell.fitted_range, None
     try:
@@ -70,6 +71,7 @@ def compensate(cell: Cell, log: Log) -> Corrected:
 
     Raises InputError where a row has no equilibrium, or exceeds the envelope of the cell's limits.
     """
+    _require_arm(cell, log)
     loads = log.loads(by_approach(cell.model.terms))
     corrected = correct(cell.model, log.require("target_q", "actual_q"), loads)
     failed = np.flatnonzero(~np.isfinite(corrected.residual))
@@ -92,6 +94,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
         identify_compliance,  # predict need not wait for it
     )
 
+    _require_arm(cell, log)
     metrology = replace(cell.metrology, remounted=remounted)
     warnings = pose_warnings(cell, log, metrology)
     estimate = identify_compliance(cell.model, log, metrology)
@@ -126,6 +129,7 @@ def diagnose(
     from gapbridge.core.log.alignment import aligned
     from gapbridge.core.motion import without_turns
 
+    _require_arm(cell, log, *([] if simulated is None else [simulated]))
     for name in withhold:
         effect_named(name)
     files = _sources(cell, log, simulated)
@@ -147,6 +151,16 @@ def diagnose(
         raise LogError(f"{log.path}: {error}") from None
     origin = provenance(files, "diagnose", withhold=list(withhold), remounted=remounted)
     return Diagnosed(cell, log, diagnosis, document(diagnosis) | {"provenance": origin})
+
+
+def _require_arm(cell: Cell, *logs: Log) -> None:
+    """Raise LogError for a log that was read for an arm of another number of joints."""
+    for log in logs:
+        if log.n != cell.arm.n:
+            raise LogError(
+                f"{log.path}: found a log of {log.n} joints, expected {cell.arm.n} as the arm of "
+                f"{cell.path} has"
+            )
 
 
 def _sources(cell: Cell, log: Log, simulated: Log | None = None) -> dict[str, list[Path]]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -141,3 +143,16 @@ def test_the_examples_of_the_page_run(desk: Path, monkeypatch: pytest.MonkeyPatc
         assert (desk / name).exists()
     driver, wanted = names["driver"], names["wanted"]
     assert 1e-5 < np.abs(driver.q - wanted).max() < 0.01  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("job", [api.predict, api.compensate, api.fit, api.diagnose])
+def test_a_log_of_another_arm_is_refused(desk: Path, job: Callable[..., object]) -> None:
+    cell = api.load_cell(desk / "cell.yaml")
+    log = api.read_log(desk / "log.csv", cell)
+    row = "{a: 0.2, alpha: 0.3, d: 0.1, mass: 1}"
+    (desk / "seven.yaml").write_text(f"robot: {{dh: [{', '.join([row] * 7)}]}}\n")
+    seven = api.load_cell(desk / "seven.yaml")
+    with pytest.raises(api.InputError, match=r"log\.csv: found a log of 6 joints, expected 7 as"):
+        job(seven, log)
+    with pytest.raises(api.InputError, match="found a log of 7 joints, expected 6"):
+        api.diagnose(cell, log, simulated=replace(log, n=7))
