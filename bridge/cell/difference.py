@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,9 +12,9 @@ import numpy as np
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects import Site, Term
-from gapbridge.core.errors import key_path
+from gapbridge.core.errors import EquilibriumError, key_path
 from gapbridge.core.loads import Loads
-from gapbridge.core.model import Model
+from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import rotation_vector
 
 POSES = 200
@@ -47,14 +48,15 @@ class PartChange:
     """One part of the model that differs, and how far it alone moves the predicted TCP.
 
     ``name`` is tool, payload, gravity, reference_temperature or an effect; an effect has a site
-    and its terms ``before`` and ``after`` (None: the cell does not have it).
+    and its terms there ``before`` and ``after``, several of which add up (none: the cell does not
+    have it).
     """
 
     name: str
     shift: TcpShift | None
     site: Site | None = None
-    before: Term | None = None
-    after: Term | None = None
+    before: tuple[Term, ...] = ()
+    after: tuple[Term, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -89,15 +91,19 @@ def key_changes(before: Cell, after: Cell) -> list[KeyChange]:
 
 
 def _effects_by_name(effects: list[dict[str, Any]]) -> dict[str, Any]:
-    parameters: dict[str, Any] = {}
+    """Return the parameters of each effect at its joint; a list of them where it is there twice."""
+    parameters: dict[str, list[Any]] = {}
     for entry in effects:
         name = str(entry["effect"])
         if entry.get("joint") is not None:
             name += f" of joint {entry['joint']}"
         if entry.get("order") is not None:
             name += f", order {entry['order']:g}"
-        parameters[name] = entry["parameters"]
-    return parameters
+        parameters.setdefault(name, []).append(entry["parameters"])
+    return {
+        name: found[0] if len(found) == 1 else sorted(found, key=str)
+        for name, found in parameters.items()
+    }
 
 
 def _key_differences(keys: tuple[str | int, ...], one: Any, other: Any) -> Iterator[KeyChange]:
@@ -140,15 +146,23 @@ def part_changes(before: Cell, after: Cell, q: Array | None = None, loads: Loads
         for name, keys in MODEL_FIELDS.items()
         if any(not np.array_equal(getattr(old, k), getattr(new, k)) for k in keys)
     ]
-    one, other = ({(t.effect, t.site): t for t in model.terms if any(t.values)}
-                  for model in (old, new))  # fmt: skip
+    one, other = _terms_by_site(old), _terms_by_site(new)
     for key in dict.fromkeys([*one, *other]):
-        if one.get(key) != other.get(key):
+        was, now = one.get(key, ()), other.get(key, ())
+        if was != now:
             kept = [term for term in old.terms if (term.effect, term.site) != key]
-            added = [other[key]] if key in other else []
-            shift = _model_shift(old, replace(old, terms=(*kept, *added)), q, loads)
-            parts.append(PartChange(key[0], shift, key[1], one.get(key), other.get(key)))
+            shift = _model_shift(old, replace(old, terms=(*kept, *now)), q, loads)
+            parts.append(PartChange(key[0], shift, key[1], was, now))
     return sorted(parts, key=lambda part: -(part.shift.rms if part.shift else 0.0))
+
+
+def _terms_by_site(model: Model) -> dict[tuple[str, Site], tuple[Term, ...]]:
+    """Return the terms of each effect at each site, in order of their values."""
+    found: dict[tuple[str, Site], tuple[Term, ...]] = {}
+    for term in sorted((t for t in model.terms if any(t.values)), key=lambda t: t.values):
+        key = term.effect, term.site
+        found[key] = (*found.get(key, ()), term)
+    return found
 
 
 def _random_poses(cell: Cell, seed: int) -> Array:
@@ -160,7 +174,7 @@ def _random_poses(cell: Cell, seed: int) -> Array:
 
 def _model_shift(before: Model, after: Model, q: Array, loads: Loads | None) -> TcpShift | None:
     """Return how far the predicted TCP moves; None: no pose has an equilibrium."""
-    one, other = (model.predict(q, loads) for model in (before, after))
+    one, other = (_predicted(model, q, loads) for model in (before, after))
     shift = other.position - one.position
     valid = np.isfinite(shift).all(axis=1)
     if not valid.any():
@@ -175,3 +189,17 @@ def _model_shift(before: Model, after: Model, q: Array, loads: Loads | None) -> 
         where=q[valid][int(np.argmax(distance))],
         mean=shift[valid].mean(axis=0),
     )
+
+
+def _predicted(model: Model, q: Array, loads: Loads | None) -> Poses:
+    """Return the poses of the TCP, NaN where the arm has no equilibrium."""
+    try:
+        return model.predict(q, loads)
+    except EquilibriumError:
+        found = Poses(np.full((len(q), 3), np.nan), np.full((len(q), 3, 3), np.nan))
+    for r in range(len(q)):
+        row = slice(r, r + 1)
+        with contextlib.suppress(EquilibriumError):
+            pose = model.predict(q[row], None if loads is None else loads[row])
+            found.position[row], found.rotation[row] = pose.position, pose.rotation
+    return found

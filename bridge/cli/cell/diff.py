@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -135,23 +136,24 @@ def _mm(vector: np.ndarray[Any, Any]) -> str:
 def _values(part: PartChange, one: Arm, other: Arm) -> str:
     """Return the parameters of an effect, before and after; zero in both is left out."""
     before, after = _reported(part.before, one), _reported(part.after, other)
-    pairs = [(b, a) for b, a in zip(before or after, after or before, strict=True)]
+    longest = max((*before, *after), key=len)  # of a term that ends before its optional parameter
     texts = []
-    for old, new in pairs:
-        unit, factor = unit_of(new.unit)
-        name = new.part if len(pairs) > 1 else ""
-        values = [v.value * factor for v in (old, new)]
-        if not any(values):
-            continue
-        shown = f"{values[1]:.4g}" if not before or not after else (
-            f"{values[0]:.4g} -> {values[1]:.4g}"
-        )  # fmt: skip
-        texts.append(f"{name} {shown} {unit}".strip())
+    for k, number in enumerate(longest):
+        unit, factor = unit_of(number.unit)
+        name = number.part if len(longest) > 1 else ""
+        sides = [
+            [factor * term[k].value if k < len(term) else 0.0 for term in side]
+            for side in (before, after)
+            if side
+        ]
+        if any(map(any, sides)):
+            shown = " -> ".join(" + ".join(f"{value:.4g}" for value in side) for side in sides)
+            texts.append(f"{name} {shown} {unit}".strip())
     return f"{'' if before else 'added, '}{'' if after else 'removed, was '}{', '.join(texts)}"
 
 
-def _reported(term: Term | None, arm: Arm) -> tuple[Reported, ...]:
-    return () if term is None else effect_named(term.effect).reported(arm, term, None)
+def _reported(terms: Sequence[Term], arm: Arm) -> list[tuple[Reported, ...]]:
+    return [effect_named(term.effect).reported(arm, term, None) for term in terms]
 
 
 def _print_origin(cell: Cell) -> None:

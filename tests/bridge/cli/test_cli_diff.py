@@ -72,3 +72,31 @@ def test_cells_that_agree_and_cells_of_other_joints(tmp_path: Path) -> None:
     paths[1].write_text(f"robot: {{dh: {rows}}}\n".replace("'", ""), encoding="utf-8")
     assert "cannot be compared" in gapbridge("diff", *paths).out
     assert "not found" in refused("diff", paths[0], tmp_path / "none.yaml")
+
+
+def test_an_effect_that_a_joint_has_twice_counts_whole(tmp_path: Path) -> None:
+    entry = "{effect: joint_offset, joint: 1, parameters: {value: %s}}"
+    twice = f"effects: [{entry}, {entry}]\n"
+    paths = cells(tmp_path, BEFORE + twice % ("0.005", "0.002"))
+    paths[0].write_text(BEFORE + twice % ("0.001", "0.002"), encoding="utf-8")
+    out = gapbridge("diff", *paths).out
+    assert "(joint_offset) of joint 1: 1 + 2 -> 2 + 5 mrad; alone" in out
+    changes = json.loads(gapbridge("diff", *paths, "--json").out)["changes"]
+    assert changes[0]["before"] == [{"value": 0.001}, {"value": 0.002}]
+    paths[0].write_text(BEFORE + twice % ("0.002", "0.005"), encoding="utf-8")
+    assert "no key differs" in gapbridge("diff", *paths).out
+
+
+def test_poses_without_equilibrium_are_left_out(tmp_path: Path) -> None:
+    limp = f"compliance: {{axial: {[0.005] * 6}}}\npayload: {{mass: 12}}\n"
+    answer = gapbridge("diff", *cells(tmp_path, BEFORE + limp), "--json")
+    assert answer.code == 0
+    assert 0 < json.loads(answer.out)["moved"]["poses"] < 200
+
+
+def test_a_link_with_and_without_its_second_twist_is_compared(tmp_path: Path) -> None:
+    nearly = "robot: {model: ur10e, calibration: {delta_alpha: [0, 1e-3, 0, 0, 0, 0]}}\n"
+    entry = "effects: [{effect: link_geometry, joint: 2, parameters: {a: 1e-4, d: 0, alpha: 0%s}}]"
+    paths = cells(tmp_path, nearly + entry % ", beta: 1e-3")
+    paths[0].write_text(nearly + entry % "", encoding="utf-8")
+    assert "a 0.1 -> 0.1 mm, beta 0 -> 1 mrad; alone" in gapbridge("diff", *paths).out
