@@ -69,6 +69,7 @@ class Reason(Enum):
     NO_TARGET = auto()
     WRENCH_UNKNOWN = auto()  # topics, columns that it could be
     POSE_UNNAMED = auto()  # topics
+    NO_ROTATION = auto()  # topic, messages without one, messages
     TAKEN_AS = auto()  # topic, column, frame
     EFFORT_UNKNOWN = auto()  # topic
     NO_COMMON_TIME = auto()  # topic, the other

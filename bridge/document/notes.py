@@ -86,6 +86,7 @@ TEXTS = {
     Reason.NO_TARGET: "target_q: no topic has it, so that tracking cannot be observed",
     Reason.WRENCH_UNKNOWN: "{0}: left out; say what it measures with --wrench {1:or}",
     Reason.POSE_UNNAMED: "{0}: left out; name the tracker's topic with --topic pose=TOPIC",
+    Reason.NO_ROTATION: "{0}: orientation left out; {1} of {2} messages have none",
     Reason.TAKEN_AS: "{0}: taken as {1}, its axes are those of {2!r}",
     Reason.EFFORT_UNKNOWN: "{0}: effort left out; where it is Nm (some drivers report A) say "
     "--effort-is-torque",

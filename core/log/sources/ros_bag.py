@@ -135,7 +135,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
     try:
         bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         bag.open()
-    except (AnyReaderError, OSError) as error:
+    except (AnyReaderError, OSError, ValueError) as error:  # ValueError: bytes that are no text
         raise LogError(f"{path}: found no readable bag ({error})") from None
     with contextlib.closing(bag):
         yield bag
@@ -287,11 +287,14 @@ def _streams(
         from scipy.spatial.transform import Rotation
 
         one = samples["pose"]
-        turns = Rotation.from_quat([row["measured_rotation"] for row in one.rows])
-        columns = {
-            "measured_position": np.array([row["measured_position"] for row in one.rows]),
-            "measured_rotation": turns.as_rotvec(),
-        }
+        columns = {"measured_position": np.array([row["measured_position"] for row in one.rows])}
+        turns = np.array([row["measured_rotation"] for row in one.rows])
+        length = np.linalg.norm(turns, axis=1)
+        without = int(np.sum(~(np.isfinite(length) & (length > 0))))  # a tracker of points alone
+        if without:
+            notes.append(Note(Reason.NO_ROTATION, (one.topic, without, len(turns))))
+        else:
+            columns["measured_rotation"] = Rotation.from_quat(turns).as_rotvec()
         streams.append(Stream(one.topic, np.array(one.time), columns).in_order())
     return streams
 

@@ -92,14 +92,14 @@ class Bag:
             feedback=points[1],
         )  # fmt: skip
 
-    def pose(self, k: int, topic: str = "/tracker/pose") -> None:
+    def pose(self, k: int, topic: str = "/tracker/pose", turned: bool = True) -> None:
         types = self.store.types
         at = 100 + 0.02 * k
         half = 0.01 * k / 2
         pose = types["geometry_msgs/msg/Pose"](
             position=types["geometry_msgs/msg/Point"](x=0.1 * k, y=0.0, z=1.0),
             orientation=types["geometry_msgs/msg/Quaternion"](
-                x=0.0, y=0.0, z=np.sin(half), w=np.cos(half)
+                x=0.0, y=0.0, z=np.sin(half) * turned, w=np.cos(half) * turned
             ),
         )
         self.write(topic, "geometry_msgs/msg/PoseStamped", at, header=self.header(at), pose=pose)
@@ -158,6 +158,20 @@ def test_a_tracker_is_interpolated_to_the_joints_times(bag: Bag, tmp_path: Path)
     assert np.allclose(found.columns["measured_position"][:, 0], 0.1 * time / 0.02)
     assert np.allclose(found.columns["measured_rotation"][:, 2], 0.01 * time / 0.02)
     assert Reason.UNCOVERED in [note.reason for note in found.notes]
+
+
+def test_a_tracker_of_points_has_no_orientation(bag: Bag, tmp_path: Path) -> None:
+    """A message of ROS 1 whose orientation nobody sets holds zeros, which are no rotation."""
+    with bag.writer:
+        for k in range(ROWS):
+            bag.joint_state(k)
+            bag.pose(k, turned=k != 7)
+    options = SourceOptions(topics={"pose": "/tracker/pose"})
+    found = source_of(tmp_path / "bag").read(tmp_path / "bag", (), options)
+    assert found.columns["measured_position"].shape == (ROWS, 3)
+    assert "measured_rotation" not in found.columns
+    note = next(note for note in found.notes if note.reason is Reason.NO_ROTATION)
+    assert note.values == ("/tracker/pose", 1, ROWS)
 
 
 def test_a_gap_of_the_tracker_is_no_measurement(bag: Bag, tmp_path: Path) -> None:
@@ -281,9 +295,10 @@ def test_a_ros_1_bag_is_read(tmp_path: Path) -> None:
     assert np.allclose(found.columns["actual_q"][3], [angles(3)[name] for name in UR_JOINTS])
 
 
-def test_a_broken_bag_is_one_clear_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", [b"#ROSBAG V2.0\nnot really", b"\x8d\xff\n", b""])
+def test_a_broken_bag_is_one_clear_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "broken.bag"
-    path.write_bytes(b"#ROSBAG V2.0\nnot really")
+    path.write_bytes(content)
     with pytest.raises(LogError, match=r"broken.bag: found no readable bag"):
         source_of(path).read(path, UR_JOINTS, SourceOptions())
 
