@@ -45,10 +45,14 @@ class LargeLog:
             files = files_of(self.path)
             reported = reported_columns(self.path)
             show_notes(self.path, (*damages(self.path), *missing_values(reported)))
+        empty = True
         for file in files:
             for piece in LogPieces(file, self.cell.arm.n, self.rows, self.motions, reported):
                 check_log(piece, self.cell)
+                empty = False
                 yield piece
+        if empty:
+            open_log(self.path, self.cell)  # says what is wrong with it
 
 
 def pieces_of(path: Path, cell: Cell) -> Iterable[Log]:

@@ -172,3 +172,11 @@ def test_a_recording_that_holds_no_measured_poses_says_so(tmp_path):
     run = tmp_path / "run-20260101-000000-001.mcap"
     text = refused("fit", run, "--cell", cell_in(tmp_path), "--out", tmp_path / "new.yaml")
     assert "found no measured_position_0..2" in text
+
+
+def test_a_recording_of_nothing_is_refused(tmp_path):
+    recording = tmp_path / "run-001.mcap"
+    recording.write_bytes(b"\x89MCAP0\r\n")  # a run that was killed before its first chunk
+    out = tmp_path / "new.yaml"
+    assert "found no cycles" in refused("fit", recording, "--cell", cell_in(tmp_path), "--out", out)
+    assert not out.exists()
