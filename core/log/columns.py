@@ -32,7 +32,7 @@ COLUMNS: dict[str, int | None] = {
     "measured_rotation": 3,
     "actual_TCP_pose": 6,  # of a simulator: what the controller takes its TCP for, no measurement
 }
-INDEXED = re.compile(r"(.+)_(\d+)$")
+INDEXED = re.compile(r"(.+)_(\d{1,9})$")
 ALIKE = 0.85  # likeness of two names from which one may be the other misspelt
 # RTDE fields with names similar to a log's columns: not treated as misspelt
 OTHERS = {
@@ -116,6 +116,7 @@ def nearest(names: Sequence[str]) -> str:
         stem = re.sub(r"_\d+$", "", name)
         near = difflib.get_close_matches(stem.lower(), COLUMNS, n=1, cutoff=0.6)
         if near:
-            return f"; found {name!r}, did you mean {near[0]!r}?"
+            end = "" if COLUMNS[near[0]] == 0 else name[len(stem) :] or "_0"
+            return f"; found {name!r}, did you mean {near[0] + end!r}?"
     more = ", ..." if len(names) > 6 else ""
     return f" ({', '.join(names[:6])}{more}), expected RTDE field names"

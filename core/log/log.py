@@ -6,6 +6,7 @@ checked when it is used. CSV is read by numpy, Parquet by pyarrow.
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -289,14 +290,14 @@ def csv_table(
     if not wanted:
         return np.empty((len(lines), 0))
     rows = [line.replace(",", ".") for line in lines] if delimiter == ";" else lines
-    try:
-        return np.loadtxt(rows, delimiter=delimiter, usecols=wanted, ndmin=2, comments=None)
-    except ValueError:
-        return np.array([
-            [cell_number(path, number, names[i], cell, delimiter) for i, cell in
-             enumerate(line.split(delimiter)) if i in wanted]
-            for number, line in zip(numbers, lines, strict=True)
-        ])  # fmt: skip
+    if len(names) > 1 or all(map(str.strip, lines)):  # numpy leaves out a blank line: a lone cell
+        with contextlib.suppress(ValueError):
+            return np.loadtxt(rows, delimiter=delimiter, usecols=wanted, ndmin=2, comments=None)
+    return np.array([
+        [cell_number(path, number, names[i], cell, delimiter) for i, cell in
+         enumerate(line.split(delimiter)) if i in wanted]
+        for number, line in zip(numbers, lines, strict=True)
+    ])  # fmt: skip
 
 
 def is_comment(line: str) -> bool:
@@ -361,15 +362,16 @@ def grouped(
     for name, indices in found.items():
         expected = COLUMNS[name] or n
         what = f"{expected} columns {name}_0..{expected - 1}"
-        for index in range(max(max(indices) + 1, expected)):
-            if index >= expected:
-                per = f" of a {n}-joint arm" if COLUMNS[name] is None else ""
-                raise LogError(
-                    f"{path}: column {name}_{index}: found one too many, expected {what}{per}"
-                )
+        for index in range(expected):
             if index not in indices:
                 first = f"; they count from {min(indices)} here" if min(indices) else ""
                 raise LogError(f"{path}: column {name}_{index}: not found, expected {what}{first}")
+        if len(indices) > expected:
+            index = min(set(indices) - set(range(expected)))
+            per = f" of a {n}-joint arm" if COLUMNS[name] is None else ""
+            raise LogError(
+                f"{path}: column {name}_{index}: found one too many, expected {what}{per}"
+            )
         columns[name] = np.empty((rows, expected))
         for k in range(expected):
             columns[name][:, k] = column(indices[k])

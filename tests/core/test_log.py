@@ -218,19 +218,21 @@ UNUSABLE = {
     "first missing": (table(JOINTS[1:], [[1] * 5]), "column actual_q_0: not found"),
     "from 1": (table([f"actual_q_{i}" for i in range(1, 7)], [[1] * 6]),
                "actual_q_0: not found, expected 6 columns actual_q_0..5; they count from 1 here"),
-    "capitals": (table(["ACTUAL_Q_0"], [[1]]), "found 'ACTUAL_Q_0', did you mean 'actual_q'"),
+    "capitals": (table(["ACTUAL_Q_0"], [[1]]), "found 'ACTUAL_Q_0', did you mean 'actual_q_0'"),
     "too few joints": (table(JOINTS[:5], [[1] * 5]), "column actual_q_5: not found"),
     "seven joints": (table([*JOINTS, "actual_q_6"], [[1] * 7]),
                      "column actual_q_6: found one too many, expected 6 columns actual_q_0..5 of a "
                      "6-joint arm"),
-    "far index": (table([*JOINTS, "actual_q_99"], [[1] * 7]), "actual_q_6: found one too many"),
+    "far index": (table([*JOINTS, "actual_q_99"], [[1] * 7]), "actual_q_99: found one too many"),
+    "endless index": (table(["actual_q_" + "1" * 5000], [[1]]), "found none that a log may hold"),
+    "no index": (table(["actual_q"], [[1]]), "found 'actual_q', did you mean 'actual_q_0'?"),
     "position of two": (table(["measured_position_0", "measured_position_1"], [[1, 2]]),
                         "column measured_position_2: not found, expected 3"),
     "double vector": (table([*JOINTS, "actual_q_3"], [[1] * 7]), "actual_q_3: found twice"),
     "double scalar": (table(["payload", "payload"], [[1, 2]]), "column payload: found twice"),
     "nothing known": (table(["x", "y"], [[1, 2]]), "found none that a log may hold"),
     "misspelt": (table(["mesured_position_0"], [[1]]),
-                 "found 'mesured_position_0', did you mean 'measured_position'?"),
+                 "found 'mesured_position_0', did you mean 'measured_position_0'?"),
 }  # fmt: skip
 
 
@@ -244,6 +246,14 @@ def test_unusable_files_are_reported_in_one_line(tmp_path, case):
     assert message in reported
     assert reported.startswith(str(path))
     assert "\n" not in reported
+
+
+def test_a_blank_line_of_an_only_column_is_an_empty_cell(tmp_path):
+    path = write(tmp_path, "actual_q_0\n0.1\n\n0.3\n")
+    for log in (read_log(path, 1), *LogPieces(path, 1)):
+        np.testing.assert_array_equal(log.columns["actual_q"][:, 0], [0.1, np.nan, 0.3])
+        with pytest.raises(LogError, match="row 3, column actual_q_0: found nothing"):
+            log.require("actual_q")
 
 
 def test_what_is_no_text_is_reported(tmp_path):
