@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.cell.document import number_text
+from gapbridge.bridge.cell.document import number_text, one_line
 from gapbridge.bridge.cell.robot import DELTAS
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import InputError
@@ -48,9 +48,9 @@ def _header(facts: ControllerFacts, options: InitOptions) -> Iterator[str]:
 def _robot(facts: ControllerFacts, options: InitOptions) -> Iterator[str]:
     yield "robot:"
     if options.urdf is not None:
-        yield f"  urdf: {options.urdf}"
+        yield f"  urdf: {one_line(options.urdf)}"
         if options.tip is not None:
-            yield f"  tip: {options.tip}"
+            yield f"  tip: {one_line(options.tip)}"
     else:
         model = options.model or facts.model
         if model is None:
@@ -119,7 +119,7 @@ def _other_sections(facts: ControllerFacts, options: InitOptions) -> Iterator[st
     yield from ("", "metrology:", "  registered: false  # an instrument's frame is estimated along")
     yield from ("  sigma: 2.0e-05  # m, 1 sigma of one coordinate of your instrument", "", "link:")
     for key, value in options.link.items():
-        yield f"  {key}: {value}"
+        yield f"  {key}: {one_line(value)}"
     if facts.rate is not None and "rate" not in options.link:
         yield f"  rate: {number_text(facts.rate)}  # Hz"
     known = None if facts.model is None else builtin_arm(facts.model).limits.velocity

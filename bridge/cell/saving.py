@@ -14,30 +14,14 @@ import numpy as np
 import yaml
 
 from gapbridge.bridge.cell.cell import Cell, cell_of
-from gapbridge.bridge.cell.document import number_text, parse
+from gapbridge.bridge.cell.document import CellDumper, number_text, one_line, parse
 from gapbridge.bridge.cell.effects import compliance_entry, effect_entries
 from gapbridge.bridge.document.output_file import replacing
 from gapbridge.core.errors import CellError, InputError, RunError
-from gapbridge.core.files import Document, loaders
+from gapbridge.core.files import Document
 from gapbridge.core.model import Model
 
 PLAIN = re.compile(r"(?!(?:y|n|yes|no|on|off|true|false|null|nan|inf)$)[a-z][a-z_]*", re.IGNORECASE)
-
-
-class _Dumper(yaml.SafeDumper):
-    """YAML whose numbers read back exactly."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        """Write no aliases."""
-        return True
-
-
-_Dumper.add_representer(
-    float, lambda d, value: d.represent_scalar("tag:yaml.org,2002:float", number_text(value))
-)
-for _first, _resolvers in loaders()[-1].yaml_implicit_resolvers.items():
-    for _tag, _pattern in _resolvers:  # 1e5 as a text: quoted, since cells are read as YAML 1.2
-        _Dumper.add_implicit_resolver(_tag, _pattern, [_first])
 
 
 def save_cell(
@@ -95,7 +79,7 @@ def _text(cell: Cell, path: Path, model: Model, sections: dict[str, Any] | None)
     expected.update(changes)
     if edited is not None and _reads_as(edited, path, expected):
         return edited
-    return yaml.dump(expected, Dumper=_Dumper, sort_keys=False, allow_unicode=True,
+    return yaml.dump(expected, Dumper=CellDumper, sort_keys=False, allow_unicode=True,
                      default_flow_style=None, width=100)  # fmt: skip
 
 
@@ -119,8 +103,7 @@ def _edited(
     for keys, moved in paths.items():
         node = document.node(keys)
         if isinstance(node, yaml.ScalarNode):
-            scalar = yaml.dump(moved, Dumper=_Dumper, width=10**6).split("\n")[0]
-            edits.add((node.start_mark.index, node.end_mark.index, scalar))
+            edits.add((node.start_mark.index, node.end_mark.index, one_line(moved)))
     appended = ""
     for key, value in changes.items():
         pair = next(((k, v) for k, v in document.root.value if k.value == key), None)

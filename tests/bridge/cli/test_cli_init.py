@@ -16,6 +16,9 @@ from patience import PATIENCE
 from ports import free_port, own_host
 
 from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.document import parse
+from gapbridge.bridge.cell.first_cell import InitOptions, first_cell_text
+from gapbridge.drivers.controller_facts import ControllerFacts
 
 CONFIG = Path(__file__).parents[3] / "config"
 PIPER = ("--driver", "can", "--profile", "piper", "--urdf", CONFIG / "piper.urdf", "--tip", "link6")
@@ -184,3 +187,11 @@ def test_a_calibrated_cell_replaces_no_log(tmp_path: Path) -> None:
     cell.write_text("robot: {model: ur10e}\n")
     line = refused("calibrate", cell, "--apply", tmp_path / "log.csv")
     assert "log.csv: found .csv, expected .yaml or .yml" in line
+
+
+def test_names_that_yaml_reads_otherwise_are_quoted() -> None:
+    link = {"driver": "can", "profile": "cell #2.yaml", "channel": "1e5", "options": {"a": None}}
+    options = InitOptions(link, urdf="arm #2: left.urdf", tip="yes")
+    data = parse(first_cell_text(ControllerFacts(n=6), options), Path("cell.yaml")).data
+    assert data["robot"] == {"urdf": "arm #2: left.urdf", "tip": "yes"}
+    assert data["link"] == link
