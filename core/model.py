@@ -116,7 +116,10 @@ class Model:
         return chain
 
     def rows(self, q: Array, loads: Loads | None = None) -> Rows:
-        """Return joint angles and loads per row with effects; ``q`` (N, n) are encoder angles."""
+        """Return joint angles and loads per row with effects; ``q`` (N, n) are encoder angles.
+
+        Raises InputError for arrays of other shapes: the kernels would read beyond them.
+        """
         loads = loads or Loads()
         count, n = q.shape
         mass = np.full(count, float(self.payload_mass)) if loads.payload_mass is None else (
@@ -129,6 +132,12 @@ class Model:
             np.array(loads.wrench, dtype=float, order="C")
         )  # fmt: skip
         rows = Rows(np.array(q, dtype=float, order="C"), np.ones((count, n)), mass, cog, wrench)
+        for name, found, expected in (
+            ("q", rows.q, (count, self.arm.n)), ("payload_mass", mass, (count,)),
+            ("payload_cog", cog, (count, 3)), ("wrench", wrench, (count, 6)),
+        ):  # fmt: skip
+            if found.shape != expected:
+                raise InputError(f"{name}: found an array {found.shape}, expected {expected}")
         self.condition(rows, loads, q, self.conditions())
         return rows
 

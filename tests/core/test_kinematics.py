@@ -6,6 +6,8 @@ from oracle import rigid
 from test_equilibrium import SEVEN
 
 from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_names, builtin_rows
+from gapbridge.core.errors import InputError
+from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 
 TCP = np.array([0.03, -0.05, 0.18])
@@ -47,3 +49,21 @@ def test_the_jacobian_of_a_deflected_arm_is_its_finite_difference_where_bending_
         d = np.eye(7)[i] * step
         change = model.predict(q + d).position[0] - model.predict(q - d).position[0]
         np.testing.assert_allclose(change / (2 * step), J[:3, i], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("q", "loads", "found"),
+    [
+        ((5, 5), Loads(), r"q: found an array \(5, 5\), expected \(5, 6\)"),
+        ((5, 7), Loads(), r"q: found"),
+        ((5, 6), Loads(payload_mass=np.ones(1)), r"payload_mass: found an array \(1,\)"),
+        ((5, 6), Loads(payload_cog=np.ones(3)), r"payload_cog: .* expected \(5, 3\)"),
+        ((5, 6), Loads(wrench=np.ones((5, 3))), r"wrench: .* expected \(5, 6\)"),
+    ],
+)
+def test_arrays_of_other_shapes_are_refused(q, loads, found):
+    """The kernels would read beyond them."""
+    model = Model(builtin_arm("ur10e"))
+    for job in (model.predict, model.linear_form):
+        with pytest.raises(InputError, match=found):
+            job(np.zeros(q), loads)
