@@ -37,7 +37,7 @@ class Stream:
         """Return the columns interpolated to other times, and where that can be done (N,).
 
         Not before the first and after the last sample, nor inside of a gap. Rotation vectors
-        (``measured_rotation``) go along the shortest rotation.
+        (``measured_rotation``) go along the shortest rotation. NaN beside a missing sample.
         """
         covered = (time >= self.time[0]) & (time <= self.time[-1])
         for begin, length in self.gaps():
@@ -48,8 +48,11 @@ class Stream:
             if name == "measured_rotation" and len(self.time) > 1:
                 from scipy.spatial.transform import Rotation, Slerp
 
-                turn = Slerp(self.time, Rotation.from_rotvec(values))
+                missing = np.isnan(values.sum(axis=1))
+                kept = np.where(np.isnan(values), 0.0, values)
+                turn = Slerp(self.time, Rotation.from_rotvec(kept))
                 found[name] = turn(inside).as_rotvec()
+                found[name][np.interp(inside, self.time, missing) > 0] = np.nan  # as a number is
             else:
                 found[name] = np.column_stack(
                     [np.interp(inside, self.time, values[:, k]) for k in range(values.shape[1])]

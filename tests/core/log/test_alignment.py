@@ -81,3 +81,14 @@ def test_a_simulator_may_count_angles_on_another_turn() -> None:
     simulated.columns["target_q"][50:] += 2 * np.pi
     found = aligned(simulated, log)
     np.testing.assert_allclose(found.columns["target_q"], log.columns["target_q"], atol=1e-12)
+
+
+def test_a_rotation_that_a_row_lacks_is_missing_there_alone() -> None:
+    turned = np.column_stack([0.1 * T, 0 * T, 0 * T])
+    turned[52] = np.nan
+    log = moving(T[10:150:7] + 0.003)
+    found = aligned(moving(T, measured_rotation=turned), log).columns["measured_rotation"]
+    lost = np.abs(log.columns["timestamp"] - T[52]) < 0.01
+    assert lost.any()
+    assert np.isnan(found[lost]).all()
+    np.testing.assert_allclose(found[~lost, 0], 0.1 * log.columns["timestamp"][~lost], atol=1e-9)
