@@ -110,6 +110,8 @@ def judge(selection: Selection, held_out: HeldOut) -> Judgement:
         accused.remove(c)
     judgement = _verdict(whole, selection, accused, withdrawn, withdrawn_any)
     unknown = judgement.structured or unnamed_part.columns.shape[1] > 0
+    # positions in motion: neighbours in time share their errors, whatever these are
+    unknown |= selection.observation.channel == "position" and selection.observation.order_in_time
     return replace(judgement, unnamed_part=unnamed_part if unknown else None)
 
 
@@ -456,7 +458,7 @@ def _excess_residual_p(selection: Selection) -> float:
     pure, repeats = pure_error(residual, observation.groups[selection.kept], session)
     if observation.sigma_is_whole:
         least, times = observation.sigma**2, OVER_STATED_NOISE
-    elif repeats >= MIN_REPEATS_TO_TEST:
+    elif repeats >= MIN_REPEATS_TO_TEST and not observation.order_in_time:
         least, times = max(pure, observation.sigma**2), OVER_REPEAT_SCATTER
     else:
         least, times = max(USUAL_REPEATABILITY, OVER_INSTRUMENT_SIGMA * observation.sigma) ** 2, 1.0

@@ -69,7 +69,10 @@ class Observation:
     def rebased(self, step: Array, terms: Sequence[Term]) -> Observation:
         """Return the observation after a nuisance step (p,), with columns at these terms."""
         assert self.rebase is not None
-        return replace(self.rebase(step, terms), uncertain=self.uncertain)
+        return replace(
+            self.rebase(step, terms), uncertain=self.uncertain, groups=self.groups,
+            order_in_time=self.order_in_time, instrument=self.instrument,
+        )  # fmt: skip
 
     def axial_columns(self) -> Array:
         """Return d prediction / d axial compliance (N, k, n), to first order."""

@@ -84,7 +84,7 @@ def next_measurements(
     chosen: list[Measurement] = []
     drawn = draw_trials(model, log, seed)
     for channel in channels:
-        moving = channel.selection.observation.order_in_time
+        moving = channel.selection.observation.order_in_time and channel.channel != "position"
         if channel.channel == "tracking" and not moving:
             continue
         trials = drawn if moving else drawn.at_rest

@@ -47,13 +47,19 @@ def thinned_poses(
 
     Their frames are then free.
     """
-    rows = observation.rows[drawn(_sessions(observation), most)]
+    few = drawn(_sessions(observation), most)
+    rows = observation.rows[few]
     # approach directions come from neighbouring rows: derived before rows are left out
     approach = log.approach()
     columns = dict(log.columns) | ({} if approach is None else {"approach": approach})
     part = observe(replace(log, columns=columns).select(rows))
     assert isinstance(part, Observation)
-    return replace(part, rows=rows)
+    if not observation.order_in_time:
+        return replace(part, rows=rows)
+    return replace(
+        part, rows=rows, groups=observation.groups[few], order_in_time=True,
+        instrument=observation.instrument,
+    )  # fmt: skip
 
 
 def _sessions(observation: Observation) -> Index:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.channels.recording import varying
+from gapbridge.core.derivatives import signal_noise
+from gapbridge.core.diagnosis.channels.recording import STRETCHES, varying
 from gapbridge.core.diagnosis.criteria import MIN_APPROACHES, MIN_FREEDOM_OF_SESSION
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict, stacked
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_causes
@@ -27,6 +28,7 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Poses
+from gapbridge.core.motion import time_stretches
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 from gapbridge.core.sessions import session_of, sessions_in
 
@@ -56,8 +58,10 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     Rows whose measured position is not finite are left out. Without a registered instrument the
     frame of each session is estimated (robustly) and six nuisance columns keep it free; where the
     target was remounted, three more (six with rotations) keep each session's tool point free.
-    Raises LogError where joints, loads or temperatures hold something unusable, or a session has
-    too few poses for a frame of its own.
+    Where the measured rows are a recording of motion, stretches of time are held out as they are in
+    the other channels of recordings: neighbours in time share their errors. Raises LogError where
+    joints, loads or temperatures hold something unusable, or a session has too few poses for a
+    frame of its own.
     """
     if log.get("measured_position") is None:
         return NotObservable("position", ("measured_position",))
@@ -74,13 +78,24 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if not parts:
         return NotObservable("position", ("measured_position",))
     if len(log.session_names) < 2:
-        return replace(parts[0], session=None)
+        return _in_motion(replace(parts[0], session=None), log)
     rows = np.concatenate([part.rows for part in parts])
     together = quantities(log, rows) | approaches(log.loads().approach, rows)
     for k in range(3):  # the sessions' frames differ: positions compare in base only
         together[f"measured_position_{k}"] = np.concatenate([p.measured[:, k] for p in parts])
     q = log.require("actual_q", "target_q")[rows]
-    return stacked(parts, together, pose_groups(q))
+    return _in_motion(stacked(parts, together, pose_groups(q)), log)
+
+
+def _in_motion(observation: Observation, log: Log) -> Observation:
+    """Return the observation as a recording where its rows of the log sample a motion."""
+    stretch = time_stretches(log.select(observation.rows), STRETCHES)
+    if stretch is None:
+        return observation
+    return replace(
+        observation, groups=stretch, order_in_time=True,
+        instrument=lambda: signal_noise(observation.measured - observation.predict(())),
+    )  # fmt: skip
 
 
 def _numbered(observation: Observation, session: int, rows: NDArray[np.int64]) -> Observation:
