@@ -35,7 +35,13 @@ def single_pose(observation: Observation) -> bool:
 
 
 def regions(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the region of joint space, or stretch of time, (n,) of each kept sample."""
+    """Return the region of joint space, or stretch of time, (n,) of each kept sample.
+
+    Positions in motion have few and long stretches, pauses left out: their errors may be correlated
+    over much of a slow motion (of 6 s, over 0.2 s: 24 stretches cover 81 % instead of 95, 8 92 %).
+    """
+    if observation.order_in_time and observation.channel == "position":
+        return np.asarray(observation.groups[kept] // (REGIONS // PARTS))
     if observation.order_in_time:
         t = observation.quantities["timestamp"][kept]
         share = (t - t.min()) / max(float(np.ptp(t)), 1e-9)

@@ -14,6 +14,7 @@ from gapbridge.core.diagnosis.channels.position import observe
 from gapbridge.core.diagnosis.diagnosis import Diagnosis, diagnose
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.regions import regions
 from gapbridge.core.diagnosis.separation import next_measurements
 from gapbridge.core.diagnosis.thinning import thinned_poses
 from gapbridge.core.effects import CATALOGUE, Site, Term
@@ -82,6 +83,15 @@ def test_intervals_are_over_stretches_of_time() -> None:
     width, of_rows = (np.ptp(shrink.interval) for shrink in (cause.shrink, single))
     assert width > 2 * of_rows
     assert channel.judgement.unnamed_part is not None  # the std is over them too
+
+
+def test_scatter_is_over_few_long_stretches_and_pauses_are_left_out() -> None:
+    log = recording()
+    t = log.columns["timestamp"] + np.where(np.arange(ROWS) < ROWS // 2, 0.0, 3600.0)
+    paused = observed(replace(log, columns=log.columns | {"timestamp": t}))
+    for observation in (observed(log), paused):
+        region = regions(observation, np.ones(ROWS, dtype=bool))
+        np.testing.assert_allclose(np.bincount(region), ROWS // 8, atol=1)
 
 
 def test_the_next_positions_are_measured_at_rest() -> None:
