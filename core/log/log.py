@@ -322,6 +322,8 @@ def cell_number(path: Path, row: int, name: str, cell: str, delimiter: str) -> f
     """Return the number in a cell, NaN where it is empty. Raises LogError naming row and column."""
     text = cell.strip().strip('"')
     try:
+        if "_" in text:  # Python reads 1_0 as 10
+            raise ValueError
         return float(text.replace(",", ".") if delimiter == ";" else text) if text else np.nan
     except ValueError:
         raise LogError(

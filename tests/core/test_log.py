@@ -210,6 +210,7 @@ UNUSABLE = {
     "a hole between rows": (table(JOINTS, joints(1)) + "\n" + "1,2,3,4,5,6\n",
                             "row 3: found 1 cells, expected 6"),
     "no number": (changed(1, 2, "abc"), "row 3, column actual_q_2: found 'abc', expected a number"),
+    "digits apart": (changed(1, 2, "1_0"), "row 3, column actual_q_2: found '1_0', expected a"),
     "two commas": (table(JOINTS, [["1,234,5"] * 6], ";"),
                    "row 2, column actual_q_0: found '1,234,5', expected a number"),
     "after a comment": ("# a\n" + changed(1, 2, "abc"), "row 4, column actual_q_2: found 'abc'"),
