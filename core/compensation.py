@@ -15,6 +15,7 @@ from numba import njit
 
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.effects import CATALOGUE, settling
+from gapbridge.core.errors import InputError
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.kernels import single
 from gapbridge.core.kernels.correction import correct_blocks
@@ -200,10 +201,13 @@ class Compensator:
 
         The wanted pose is the rigid, effect-free arm's at ``nominal_q``. Servo effects in the model
         (droop, dead band) are compensated too. A row that cannot be solved is returned with the
-        remaining distance in ``residual`` (inf: no equilibrium).
+        remaining distance in ``residual`` (inf: no equilibrium). Raises InputError for another
+        number of joints: the compiled call would read beyond them.
         """
         n, loads = self._n, loads or NO_LOADS
         result, nominal = np.empty(n + 6), np.ascontiguousarray(nominal_q, dtype=float)
+        if nominal.shape != (n,):
+            raise InputError(f"nominal_q: found an array {nominal.shape}, expected ({n},)")
         q, moved = result[:n], result[n:]
         if self._unconditional:
             mass, cog, wrench = loads.payload_mass, loads.payload_cog, loads.wrench

@@ -20,6 +20,7 @@ from gapbridge.core.compensation import (
     wanted_pose,
 )
 from gapbridge.core.effects import Site, Term
+from gapbridge.core.errors import InputError
 from gapbridge.core.kernels.least_offset import smallest_offset
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
@@ -106,6 +107,12 @@ def test_what_few_joints_cannot_correct_counts_apart_from_what_they_missed(n, te
     away = live.correct(q)
     live._offset[0] += 1e-3  # a solution that was not found
     assert live.missed(q, Loads(), away.residual) > 1e-5 or n >= 6
+
+
+@pytest.mark.parametrize("shape", [(5,), (7,), (1, 6)])
+def test_a_setpoint_of_another_arm_is_refused(shape):
+    with pytest.raises(InputError, match=r"nominal_q: found an array .*, expected \(6,\)"):
+        Compensator(Model(builtin_arm("ur10e"))).correct(np.zeros(shape))
 
 
 @pytest.mark.parametrize("n", [6, 7])
