@@ -15,9 +15,8 @@ from recorded import SESSION, publish
 
 from benchmarks.losing_disk import LosingDisk, Place
 from gapbridge.bridge.calibration.session.journal import FILE, Journal, read_entries
-from gapbridge.bridge.cell.saving import write_text
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
-from gapbridge.bridge.document.output_file import write_table, write_together
+from gapbridge.bridge.document.output_file import write_table, write_text, write_together
 from gapbridge.bridge.fleet.journal import Journal as FleetJournal
 from gapbridge.bridge.fleet.output import parquet
 from gapbridge.bridge.fleet.task import DONE, Outcome

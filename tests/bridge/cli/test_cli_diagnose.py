@@ -308,7 +308,7 @@ def test_a_load_under_which_the_arm_would_buckle_is_refused_by_its_row(tmp_path:
         ("actual_q_0,payload\n1,two\n", ["row 2, column payload", "found 'two'"]),
         ("actual_q_0,actual_q_1\n0,0\n", ["actual_q_2: not found, expected 6 columns"]),
         ("payload,payload\n0,0\n", ["column payload: found twice"]),
-        ("acutal_q_0,posn\n0,0\n", ["found 'acutal_q_0', did you mean 'actual_q'?"]),
+        ("acutal_q_0,posn\n0,0\n", ["found 'acutal_q_0', did you mean 'actual_q_0'?"]),
         ("\x00\xff\n", ["log.csv"]),
     ],
 )
