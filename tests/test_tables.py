@@ -43,7 +43,8 @@ def test_a_side_process_is_a_module_that_can_be_run(name: str) -> None:
 @pytest.mark.parametrize("mutant", read_mutants(), ids=lambda m: m.what)
 def test_a_listed_mistake_can_be_made_and_names_tests_that_are_there(mutant: Mutant) -> None:
     text = mutant.text(ROOT)
-    ast.parse(text)
+    if mutant.file.endswith(".py"):
+        ast.parse(text)
     assert text != (ROOT / mutant.file).read_text(encoding="utf-8")
     for test in mutant.tests:
         path, _, name = test.partition("::")
