@@ -74,6 +74,7 @@ def test_after_a_killed_loop_the_robots_program_withdraws_at_the_cells_rate(
 
 
 @pytest.mark.slow
+@pytest.mark.realtime(limit=0.03)
 def test_a_stop_takes_the_time_that_the_cells_rate_needs(robot: Robot) -> None:
     start = np.array(robot.truth()["rigid_tcp"][:3])
     with Run(robot.cell(", mode: offset, rate: 125", limits=LIMITS), arm=True) as run:
