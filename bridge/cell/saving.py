@@ -37,7 +37,7 @@ def save_cell(
     Raises RunError where the new cell could not be loaded, or not be written; nothing is written.
     """
     path = Path(path)
-    with replacing(path) as file:
+    with replacing(path) as file:  # first: in a folder that is not there no cell could be loaded
         file.write(cell_text(cell, path, model or cell.model, sections))
 
 

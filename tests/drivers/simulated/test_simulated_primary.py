@@ -39,7 +39,7 @@ def test_the_robot_mode_data_tell_a_pause_power_and_the_slider() -> None:
     server = PrimaryServer(controller, (5, 15, 0), (), ())
     dashboard = DashboardServer(controller, "5.15.0.0", "1")
 
-    def told() -> tuple[bool, bool, bool, float]:
+    def reported() -> tuple[bool, bool, bool, float]:
         """Return power_on, program_running, program_paused, target_speed_fraction."""
         fields = struct.unpack(">Q7?bB3dB", server._mode()[5:])
         return fields[3], fields[6], fields[7], fields[10]
@@ -49,11 +49,11 @@ def test_the_robot_mode_data_tell_a_pause_power_and_the_slider() -> None:
     for _ in range(50):
         controller.cycle()
     controller.write_inputs({"speed_slider_mask": 1, "speed_slider_fraction": 0.3})
-    assert told() == (True, True, False, 0.3)
+    assert reported() == (True, True, False, 0.3)
     dashboard.answer("pause")
-    assert told() == (True, False, True, 0.3)
+    assert reported() == (True, False, True, 0.3)
     dashboard.answer("stop")
     controller.set_robot_mode(modes.IDLE)
-    assert told() == (True, False, False, 0.3)
+    assert reported() == (True, False, False, 0.3)
     dashboard.answer("power off")
-    assert told() == (False, False, False, 0.3)
+    assert reported() == (False, False, False, 0.3)

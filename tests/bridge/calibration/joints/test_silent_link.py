@@ -33,7 +33,7 @@ def pose_at(q: Array) -> PlannedPose:
 
 
 class Controller:
-    """A controller at 500 Hz, whose cycles a daemon would read; it reports while it is told to."""
+    """A controller at 500 Hz, whose cycles a daemon would read; ``reports`` makes them."""
 
     def __init__(self, clock: ByHand) -> None:
         self._clock, self._rows = clock, [np.empty((0, max(s.stop for s in SLICES.values())))]
