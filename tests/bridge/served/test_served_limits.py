@@ -92,7 +92,7 @@ def _rest(link):
 
 
 def test_a_tls_handshake_that_does_not_come_is_cut_off(tmp_path, monkeypatch):
-    monkeypatch.setattr(server._Loop, "handshake_time", 0.2)
+    monkeypatch.setattr(server._Loop, "handshake_time", 2.0)  # the second must come through
     certificate, key = self_signed(tmp_path)
     settings = ServedSettings(port=free_port(), certificate=certificate, key=key)
     over = threading.Event()
