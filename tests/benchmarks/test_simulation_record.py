@@ -73,7 +73,7 @@ def test_a_run_goes_on_where_it_was_left_and_reports_what_did_not_hold(
         return Outcome(seed, "can", ["loop dies (3 lines on) at 0.9 s"], wrong, writes=2)
 
     class Pool:
-        def __init__(self, *_: Any) -> None: ...
+        def __init__(self, *_: Any, **__: Any) -> None: ...
 
         def __enter__(self) -> Pool:
             return self
