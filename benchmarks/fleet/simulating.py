@@ -6,7 +6,7 @@ The truth is the blind benchmark's mechanics, which shares nothing with the mode
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -120,16 +120,3 @@ def write_fleet(
             now = story(now, number, session) if story else now
             write_log(place / f"session-{session + 1:02d}.csv", columns(now, count, habits, rng))
     return cell, arms
-
-
-def drifting(joint: int, by: float, arm: int = 0) -> Story:
-    """Return the story of one arm whose joint (from 0) gets softer from session to session."""
-
-    def story(now: TrueArm, number: int, session: int) -> TrueArm:
-        if number != arm:
-            return now
-        axial = now.axial.copy()
-        axial[joint] *= 1 + by * session
-        return replace(now, axial=axial)
-
-    return story

@@ -17,11 +17,8 @@ import can
 from can.interfaces.socketcand.socketcand import SocketCanDaemonBus
 
 from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
-from benchmarks.links.serving import served_cell, written
-from benchmarks.server_thread import ServerThread
-from gapbridge.bridge.cell import load_cell
+from benchmarks.links.serving import served_cell, thread_served_cell
 from gapbridge.bridge.cell.cell import Cell
-from gapbridge.bridge.cell.simulation import served_controller
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.clock import SYSTEM
@@ -53,15 +50,8 @@ class PiperVirtualCase(LinkCase):
     @contextmanager
     def served(self, pause: Pause) -> Iterator[Cycles]:
         """Yield the two sides, which sleep in between: spinning starves a thread beside."""
-        with written(VIRTUAL) as path:
-            cell = load_cell(path)
-            assert cell.link is not None
-            found = served_controller(cell, cell.link)
-            with (
-                ServerThread(found.controller, found.servers, found.host),
-                _armed(cell, time.sleep) as cycles,
-            ):
-                yield cycles
+        with thread_served_cell(VIRTUAL) as cell, _armed(cell, time.sleep) as cycles:
+            yield cycles
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A cell's simulated controller in a process of its own, as ``gapbridge simulate`` serves it."""
+"""A cell's simulated controller in a process of its own (``gapbridge simulate``) or a thread."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from benchmarks.server_thread import ServerThread
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.cell import Cell
+from gapbridge.bridge.cell.simulation import served_controller
 
 ARM = """\
 robot: {model: ur10e}
@@ -46,3 +48,14 @@ def served_cell(link: str) -> Iterator[Cell]:
         finally:
             process.terminate()
             process.wait(5.0)
+
+
+@contextmanager
+def thread_served_cell(link: str) -> Iterator[Cell]:
+    """Serve a cell in a thread of this process while the block lasts; yields it loaded."""
+    with written(link) as path:
+        cell = load_cell(path)
+        assert cell.link is not None
+        found = served_controller(cell, cell.link)
+        with ServerThread(found.controller, found.servers, found.host):
+            yield cell

@@ -101,8 +101,8 @@ def _size(o: Outcome, value: float | None) -> str:
 
 def _table(outcomes: list[Outcome]) -> Table:
     table = Table(title="real logs: what is left of rows that the fit did not see")
-    for head in ("log", "channel", "half", "rows", "gap", "reported held out", "judged",
-                 "least squares", "published", "ratio", "verdict", "accused", "absurd",
+    for head in ("log", "channel", "half", "rows", "gap", "reported held out", "its new region",
+                 "judged", "least squares", "published", "ratio", "verdict", "accused", "absurd",
                  "s"):  # fmt: skip
         table.add_column(head, overflow="fold")
     for o in outcomes:
@@ -112,7 +112,7 @@ def _table(outcomes: list[Outcome]) -> Table:
             theirs = f"{1e3 * other:.3g} mm ({what}); ours {1e3 * ours:.3g}"
         table.add_row(
             o.log, o.channel, o.split, str(o.rows), _size(o, o.gap), _size(o, o.reported),
-            _size(o, o.judged), _size(o, o.rival), theirs,
+            _size(o, o.reported_new_region), _size(o, o.judged), _size(o, o.rival), theirs,
             _ratio(o), o.verdict, " ".join(o.accused) or "–",
             "; ".join(o.absurd) or "–", f"{o.seconds:.1f}",
         )  # fmt: skip

@@ -137,7 +137,6 @@ class SimulatedLink(ABC):
     ``saw`` is called with each state as it reaches the client and each write as it leaves it.
     """
 
-    carries_corruption = True  # of single numbers, as the wire's own checks do not show
     looks_again = False  # at a setpoint's age, after write_setpoint
 
     def __init__(self, world: World, clock: SimulatedClock, setting: Setting, saw: Saw) -> None:
@@ -153,7 +152,6 @@ class SimulatedLink(ABC):
         self.rebooting_until = 0.0
         self.refuses_until = 0.0  # no new connection before
         self.freezes_values = False
-        self.foreign_until = 0.0
         self.supervisor_state: Callable[[], int] = lambda: -1
         self.sends = False  # between the last look at a setpoint's age and its leaving
         self.hidden_leap = 0.0  # s, on this connection: see UrLink
@@ -259,7 +257,7 @@ class SimulatedLink(ABC):
         self.leave_mode()
         controller.release_emergency_stop()
         controller.unlock()
-        self.refuses_until = self.foreign_until = self.paused_until = 0.0
+        self.refuses_until = self.paused_until = 0.0
         self.declare(self.setting.arm[1].payload_mass)
 
     @abstractmethod

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Generic, TypeVar
@@ -76,6 +75,3 @@ class Wire(Generic[Message]):
     def _arrive(self, message: Message, generation: int) -> None:
         if generation == self._generation:
             self._deliver(message)
-
-
-NEVER = math.inf

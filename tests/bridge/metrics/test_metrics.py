@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import time
+from contextlib import closing, contextmanager
 
 import httpx
 import numpy as np
@@ -166,31 +167,33 @@ def test_a_histogram_is_cumulative_and_ends_with_all_values():
     assert buckets.sum == pytest.approx(7.0065)
 
 
+@contextmanager
 def _alone(cell):
-    """Return counts without a process of their own, and a function that returns their scrape."""
+    """Yield counts without a process of their own, and a function that returns their scrape."""
     settings = DaemonSettings.model_validate(
         {"cell": cell, "link": {"driver": "ur_rtde", "host": "127.0.0.2"}}
     )
-    counts = Counts(SharedMemory(6, clock=SYSTEM), settings, SYSTEM)
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(Families("run", counts, {}))
-    return counts, lambda: generate_latest(registry).decode()
+    with closing(SharedMemory(6, clock=SYSTEM)) as memory:
+        counts = Counts(memory, settings, SYSTEM)
+        registry.register(Families("run", counts, {}))
+        yield counts, lambda: generate_latest(registry).decode()
 
 
 def test_a_cell_whose_name_is_no_text_is_counted_too():
-    _, scraped = _alone(os.fsdecode(b"zelle_\xfc.yaml"))
-    assert 'cell="zelle_\\\\udcfc"' in scraped()
+    with _alone(os.fsdecode(b"zelle_\xfc.yaml")) as (_, scraped):
+        assert 'cell="zelle_\\\\udcfc"' in scraped()
 
 
 def test_a_loop_that_has_ended_is_disconnected_whatever_its_memory_says():
-    counts, scraped = _alone("cell.yaml")
-    counts.memory.note_state(State.COMPENSATING)
-    for named, state in (
-        ("compensating", "compensating"), ("disconnected", "disconnected"),
-        ("compiling the model", "disconnected"), ("compensating", "compensating"),
-    ):  # fmt: skip
-        counts.update([{"kind": "status", "state": named}])
-        assert f'gapbridge_state{{state="{state}"}} 1.0' in scraped()
+    with _alone("cell.yaml") as (counts, scraped):
+        counts.memory.note_state(State.COMPENSATING)
+        for named, state in (
+            ("compensating", "compensating"), ("disconnected", "disconnected"),
+            ("compiling the model", "disconnected"), ("compensating", "compensating"),
+        ):  # fmt: skip
+            counts.update([{"kind": "status", "state": named}])
+            assert f'gapbridge_state{{state="{state}"}} 1.0' in scraped()
 
 
 def test_the_names_are_also_good_openmetrics(feed):

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mjcf_pose import tcp_in_base
 from scipy.spatial.transform import Rotation
 
-from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS, mjcf, numbers, urdf
+from benchmarks.patch.arms import BASE_TURN, UR_JOINTS, mjcf, numbers, urdf
 from gapbridge.bridge.patch import Patched, PatchOptions, changes_of, format_of
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import Site, Term
@@ -31,20 +32,6 @@ Q = np.array([0.3, -0.9, 1.2, -0.4, 0.7, 0.2])
 def patched(path: Path, text: str, model: Model, options: PatchOptions) -> Patched:
     path.write_text(text)
     return format_of(path).patch(path, changes_of(model), options, [])
-
-
-def tcp_in_base(text: str, held: bool = False) -> np.ndarray:
-    """Return the TCP (3,) of an MJCF model in base at Q, or where it rests with the joints held."""
-    compiled = mujoco.MjModel.from_xml_string(text)
-    data = mujoco.MjData(compiled)
-    for name, angle in zip(UR_JOINTS, Q, strict=True):
-        joint = compiled.joint(name)
-        data.qpos[joint.qposadr[0]] = angle
-        compiled.dof_armature[joint.dofadr[0]] = 1e12  # a rotor that nothing turns
-    mujoco.mj_forward(compiled, data)
-    if held:
-        mujoco.mj_step(compiled, data, nstep=3000)
-    return BASE_TURN.inv().apply(data.site("tcp").xpos - BASE_AT)
 
 
 def with_refs(text: str, ref: float) -> str:
@@ -68,10 +55,10 @@ def test_joints_with_ref_keep_their_zero_where_their_body_moves(tmp_path: Path) 
         Term("link_geometry", Site(4), (-1e-3, 2e-3, 1e-3)),
     ])  # fmt: skip
     before = NOMINAL.predict(Q[None]).position[0]
-    assert np.allclose(tcp_in_base(given), before, rtol=0, atol=SIX_DIGITS)
+    assert np.allclose(tcp_in_base(given, Q), before, rtol=0, atol=SIX_DIGITS)
     found = patched(tmp_path / "a.xml", given, model, PatchOptions(tcp="tcp"))
     expected = model.predict(Q[None]).position[0]
-    assert np.allclose(tcp_in_base(found.text), expected, rtol=0, atol=SIX_DIGITS)
+    assert np.allclose(tcp_in_base(found.text, Q), expected, rtol=0, atol=SIX_DIGITS)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +75,7 @@ def test_springs_of_joints_with_ref_bend_as_predicted(tmp_path: Path, term: Term
     given = with_refs(mjcf(ARM, UR_JOINTS), 0.5)
     found = patched(tmp_path / "a.xml", given, model, PatchOptions(tcp="tcp"))
     deflected, rigid = model.predict(Q[None]).position[0], NOMINAL.predict(Q[None]).position[0]
-    off = np.linalg.norm(tcp_in_base(found.text, held=True) - deflected)
+    off = np.linalg.norm(tcp_in_base(found.text, Q, held=True) - deflected)
     assert off < 0.01 * np.linalg.norm(deflected - rigid)
 
 
@@ -248,7 +235,7 @@ def test_bodies_and_joints_of_a_scene_need_no_names(tmp_path: Path) -> None:
     model = OFFSET.with_terms([Term("backlash", Site(1), (0.002,))])
     found = patched(tmp_path / "a.xml", given, model, PatchOptions(tcp="tcp"))
     expected = OFFSET.predict(Q[None]).position[0]
-    assert np.allclose(tcp_in_base(found.text), expected, rtol=0, atol=SIX_DIGITS)
+    assert np.allclose(tcp_in_base(found.text, Q), expected, rtol=0, atol=SIX_DIGITS)
 
 
 MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"

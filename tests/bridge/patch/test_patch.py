@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mjcf_pose import tcp_in_base
 
 from benchmarks.patch.arms import (
     BASE_AT,
@@ -107,19 +108,6 @@ def test_a_patched_mjcf_is_where_predict_is(tmp_path: Path) -> None:
     assert not missing
 
 
-def settled(text: str, q: np.ndarray) -> np.ndarray:
-    """Return where the TCP of an MJCF model rests in base, its named joints held at q."""
-    compiled = mujoco.MjModel.from_xml_string(text)
-    data = mujoco.MjData(compiled)
-    for name, angle in zip(UR_JOINTS, q, strict=True):
-        joint = compiled.joint(name)
-        data.qpos[joint.qposadr[0]] = angle
-        compiled.dof_armature[joint.dofadr[0]] = 1e12  # a rotor that nothing turns
-    for _ in range(3000):
-        mujoco.mj_step(compiled, data)
-    return in_base(data.site("tcp").xpos)
-
-
 @pytest.mark.parametrize(
     "terms",
     [
@@ -134,7 +122,7 @@ def test_springs_bend_as_predicted(tmp_path: Path, terms: list[Term]) -> None:
     text, changed, _ = patched(tmp_path / "a.xml", mjcf(ARM, UR_JOINTS), model, "tcp")
     q = np.array([0.3, -0.6, 0.9, -0.4, 1.1, 0.2])
     deflected, rigid = model.predict(q[None]).position[0], NOMINAL.predict(q[None]).position[0]
-    found = settled(text, q)
+    found = tcp_in_base(text, q, held=True)
     assert np.linalg.norm(found - deflected) < 0.01 * np.linalg.norm(deflected - rigid)
     assert any("nq is" in line for line in changed)
 
@@ -149,7 +137,7 @@ def test_springs_bend_as_predicted_where_the_models_joints_are_elsewhere_on_thei
     text, _, _ = patched(tmp_path / "a.xml", given, model, "tcp")
     q = np.array([0.3, -0.9, 1.2, -0.4, 0.7, 0.2])
     deflected, rigid = model.predict(q[None]).position[0], NOMINAL.predict(q[None]).position[0]
-    found = settled(text, q)
+    found = tcp_in_base(text, q, held=True)
     assert np.linalg.norm(found - deflected) < 0.01 * np.linalg.norm(deflected - rigid)
 
 
