@@ -9,7 +9,7 @@ from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS
 
 
 def tcp_in_base(text: str, q: np.ndarray, held: bool = False) -> np.ndarray:
-    """Return the TCP (3,) of an MJCF model in base at ``q`` (6,); ``held``: where it rests there."""
+    """Return the TCP (3,) of an MJCF model in base at ``q`` (6,); ``held``: where it rests."""
     mujoco = pytest.importorskip("mujoco")
     compiled = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(compiled)
