@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.channels.recording import STRETCHES
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.estimation.held_out import k_means, random_folds
 
 SAME_POSE = 0.01  # rad: range of every joint below which a log has a single pose
-REGIONS = 24  # of joint space, or stretches of time
+REGIONS = 24  # of joint space
 PARTS = 8  # held out in turn, each of several scattered regions
 
 
@@ -37,15 +38,13 @@ def single_pose(observation: Observation) -> bool:
 def regions(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the region of joint space, or stretch of time, (n,) of each kept sample.
 
-    Positions in motion have few and long stretches, pauses left out: their errors may be correlated
-    over much of a slow motion (of 6 s, over 0.2 s: 24 stretches cover 81 % instead of 95, 8 92 %).
+    Pauses of a recording are no part of a stretch. Positions in motion have few and long ones:
+    their errors may be correlated over much of a slow motion (of 6 s, over 0.2 s: 24 stretches
+    cover 81 % instead of 95, 8 92 %).
     """
-    if observation.order_in_time and observation.channel == "position":
-        return np.asarray(observation.groups[kept] // (REGIONS // PARTS))
     if observation.order_in_time:
-        t = observation.quantities["timestamp"][kept]
-        share = (t - t.min()) / max(float(np.ptp(t)), 1e-9)
-        return np.asarray(np.minimum((share * REGIONS).astype(np.int64), REGIONS - 1))
+        stretch = observation.groups[kept]
+        return stretch // (STRETCHES // PARTS) if observation.channel == "position" else stretch
     conditions = np.unique(observation.groups[kept], return_inverse=True)[1].reshape(-1)
     names = [q for q in observation.quantities if q.startswith(("actual_q_", "target_q_"))]
     if not names:

@@ -19,7 +19,6 @@ from gapbridge.core.diagnosis.channels.recording import STRETCHES
 from gapbridge.core.diagnosis.criteria import MAX_OUTLIER_SHARE, PRIOR_REACH
 from gapbridge.core.diagnosis.noise_floor import BLOCK, counted_coordinates, own_coordinates
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
-from gapbridge.core.diagnosis.regions import REGIONS
 from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian, named_columns
 from gapbridge.core.diagnosis.selection.delay_columns import chord_columns, chord_value
 from gapbridge.core.diagnosis.selection.noise import Noise
@@ -171,13 +170,16 @@ class Streamed:
         order = dict(kept)
         return np.hstack([*(order[p] for p in accused), gap[:, None]])
 
+    @property
+    def _stretch(self) -> Index:
+        """Return the stretch of time (B,) of each block, pauses left out: blocks are even."""
+        return np.arange(len(self.sums)) * STRETCHES // len(self.sums)
+
     def _fitted(self, accused: Sequence[int]) -> tuple[list[Array], list[Array]]:
         if not accused:
             return [], []
         used = [*self.columns.jacobian, self.columns.width - 1]
-        span = max(float(np.ptp(self.time)), 1e-9)
-        part = ((self.time - self.time.min()) / span * REGIONS).astype(np.int64)
-        part = np.minimum(part, REGIONS - 1) if self.by_region else np.zeros_like(part)
+        part = self._stretch if self.by_region else np.zeros(len(self.sums), dtype=np.int64)
         names = np.unique(part)
         sums = np.stack([self.sums[part == name].sum(axis=(0, 1)) for name in names])
         rows = rows_of(sums[:, used][:, :, used])
@@ -210,8 +212,6 @@ class Streamed:
     def _samples(self) -> tuple[Observation, Noise]:
         """Return the samples that represent the rows, the same number for each block."""
         each, k = int(self.columns.start[-1]) + 1, len(self.inverse_sigma)
-        span = max(float(np.ptp(self.time)), 1e-9)
-        stretch = ((self.time - self.time.min()) / span * STRETCHES).astype(np.int64)
         samples = each * len(self.time)
         whole = self.excerpt.observation
         observation = replace(
@@ -219,7 +219,7 @@ class Streamed:
             measured=np.zeros((samples, k)),
             nuisance=np.zeros((samples, k, 0)),
             quantities={"timestamp": np.repeat(self.time, each)},
-            groups=np.repeat(np.minimum(stretch, STRETCHES - 1), each),
+            groups=np.repeat(self._stretch, each),
             rows=np.repeat(self.row, each),
             session=None if whole.session is None else np.repeat(self.session, each),
             joint_columns=None, friction=None, times=None, payload_mass=None, subset=None,

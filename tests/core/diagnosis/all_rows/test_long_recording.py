@@ -123,3 +123,29 @@ def test_a_channel_with_few_rows_of_a_long_recording_is_judged_on_all(recording,
     assert 300 < found.samples <= COUNT / 25  # without those where a joint reverses
     assert [c.effect for c in found.causes][:1] == ["coulomb_friction"]
     assert found.structured
+
+
+@pytest.mark.slow
+def test_a_pause_changes_no_interval(recording, monkeypatch):
+    """Beside an unknown part intervals come from stretches of time, and a pause is none."""
+    monkeypatch.setattr(blocks, "WHOLE", 8000)
+    monkeypatch.setattr(blocks, "EXCERPT", 6000)
+    monkeypatch.setattr(blocks, "DERIVED", 3000)
+    model, log = recording
+    torque = log.columns["actual_current_as_torque"].copy()
+    torque[:, 3] += 2.0 * np.sin(3 * log.columns["actual_q"][:, 3] ** 2)  # in no catalogue
+    found = []
+    for pause in (0.0, 3600.0):
+        t = log.columns["timestamp"] + pause * (np.arange(COUNT) >= 5000)
+        columns = log.columns | {"timestamp": t, "actual_current_as_torque": torque}
+        long = diagnose(model, Log("paused.csv", columns, 6))
+        found.append(next(c for c in long.channels if c.channel == "torque"))
+    one, other = found
+    assert one.structured and other.structured
+    assert [(c.effect, c.joints) for c in other.causes] == [
+        (c.effect, c.joints) for c in one.causes
+    ]
+    for own, its in zip(one.causes, other.causes, strict=True):
+        for a, b in zip(own.parameters, its.parameters, strict=True):
+            assert b.value == pytest.approx(a.value, abs=a.std)
+            assert b.std == pytest.approx(a.std, rel=0.3)

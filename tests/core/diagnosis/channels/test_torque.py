@@ -11,9 +11,11 @@ import pytest
 from further import further
 
 from gapbridge.core import dynamics
+from gapbridge.core.diagnosis.channels.recording import STRETCHES
 from gapbridge.core.diagnosis.channels.torque import observe
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
+from gapbridge.core.diagnosis.regions import regions
 from gapbridge.core.diagnosis.selection.candidate import jacobian, named_candidates
 from gapbridge.core.diagnosis.thinning import thinned
 from gapbridge.core.effects import Site, Term
@@ -192,6 +194,20 @@ def test_a_long_log_is_used_whole_and_held_out_by_stretches_of_time(plant):
     few = thinned(seen, 300)
     assert len(few.rows) == len(few.predict(())) == 300
     assert np.array_equal(few.predict(()), seen.predict(())[np.isin(seen.rows, few.rows)])
+
+
+def test_a_pause_is_no_part_of_a_stretch_of_time(plant, recorded):
+    torque = recorded[4]
+    whole = observe(plant.model(2.0), log_of(recorded, torque), METROLOGY)
+    t = recorded[0] + 600.0 * (np.arange(5000) >= 2500)
+    paused = observe(plant.model(2.0), log_of((t, *recorded[1:]), torque), METROLOGY)
+    counts = []
+    for observation in (whole, paused):
+        assert isinstance(observation, Observation)
+        stretch = regions(observation, np.ones(len(observation.groups), dtype=bool))
+        counts.append(np.bincount(stretch))
+    assert len(counts[0]) == len(counts[1]) == STRETCHES
+    assert np.abs(counts[1] - counts[0]).max() < 0.3 * counts[0].mean()
 
 
 def test_readings_that_are_missing_are_left_out(plant, recorded):
