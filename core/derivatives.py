@@ -2,8 +2,9 @@
 
 A short window passes noise, a long one biases the derivative. Per joint, the window grows while the
 derivative changes by no more than its noise explains (Lepski's rule). At jumps of the motion (the
-corners of a trapezoidal speed) short and long windows disagree; these rows are marked. Source of
-the filter: Savitzky, Golay, Analytical Chemistry 36 (1964) 1627.
+corners of a trapezoidal speed) short and long windows disagree; these rows are marked. Rows at rest
+choose no window: encoders at rest have less noise than in motion. Source of the filter: Savitzky,
+Golay, Analytical Chemistry 36 (1964) 1627.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from math import factorial
+from typing import TypeVar
 
 import numpy as np
 
 from gapbridge.core.arrays import Array, Mask
 
+Sampled = TypeVar("Sampled", Array, Mask)
 HALF_WIDTHS = (3, 4, 6, 9, 13, 19, 28, 42, 63)  # samples either side
 MAX_REACH = 0.3  # s, no window reaches further either side
 BIAS_SHARE = 0.5  # allowed bias of a longer window, over the noise
@@ -30,6 +33,9 @@ JUMP_SIGMAS = 4.5  # sigma of the noise beyond which windows disagree
 MIN_JUMP = 0.01  # of the derivative's rms: a smaller disagreement matters to nobody
 MAX_SAMPLES = 20_000  # samples beyond which evenly spread pieces of PIECE choose the windows
 PIECE = 2048
+REST_SPEED = 0.02  # of a joint's largest speed, below which it rests
+SLOPE_REACH = 0.1  # s either side, over which speeds are taken
+MIN_MOVING = 100  # samples in motion, with fewer all are used
 
 
 @dataclass(frozen=True)
@@ -42,40 +48,45 @@ class Derivative:
     unsure: Mask  # (N, n) the signal jumps here
 
 
-def signal_noise(signal: Array) -> Array:
+def signal_noise(signal: Array, moves: Mask | None = None) -> Array:
     """Return 1 sigma of the white noise on each of n smooth signals (N, n), by 4th differences.
 
     Values above the 95th percentile are excluded, for corners of the motion. Of a long signal
-    evenly spread pieces are used.
+    evenly spread pieces are used. ``moves`` (N, n): the samples that count.
     """
     if len(signal) < 8:
         return np.zeros(signal.shape[1])
-    parts = [np.diff(part, 4, axis=0) for part in _pieces(signal)]
-    size = np.abs(parts[0] if len(parts) == 1 else np.concatenate(parts)) / np.sqrt(70.0)
+    size = np.abs(np.concatenate([np.diff(part, 4, axis=0) for part in _pieces(signal)]))
+    size /= np.sqrt(70.0)
+    if moves is not None:
+        size[~np.concatenate([part[2:-2] for part in _pieces(moves)])] = np.nan
     # rms of the lower 95 % of a normal's absolute values is 0.871 sigma
-    limit = np.quantile(size, 0.95, axis=0)
+    limit = np.nanquantile(size, 0.95, axis=0)
     kept = np.where(size <= limit, size, np.nan)
     return np.asarray(np.sqrt(np.nanmean(kept**2, axis=0)) / 0.871)
 
 
-def differentiate(signal: Array, step: float, order: int, longest: float = MAX_REACH) -> Derivative:
+def differentiate(
+    signal: Array, step: float, order: int, longest: float = MAX_REACH, moves: Mask | None = None
+) -> Derivative:
     """Return the ``order``-th derivative (1 or 2) of ``signal`` (N, n), sampled every ``step`` s.
 
     No window reaches further than ``longest`` (s) either side. N must be at least 7. The windows of
-    a long signal are chosen by pieces of it.
+    a long signal are chosen by pieces of it. ``moves`` (N, n): the samples that choose them.
     """
+    moves = np.ones(signal.shape, dtype=bool) if moves is None else moves
     count, n = signal.shape
     widest = max(min(longest / step, (count - 1) // 4), 3)
     halves = [h for h in HALF_WIDTHS if h <= widest]
-    sigma = signal_noise(signal)
+    sigma = signal_noise(signal, moves)
     filters = [_polynomials(h, order)[h, ::-1] / step**order for h in halves]
-    pieces = _pieces(signal)
+    pieces, counts = _pieces(signal), np.concatenate(_pieces(moves))
     results = [[_filtered(part, h, order, step) for part in pieces] for h in halves]
     value, noise = np.empty((count, n)), np.zeros(n)
     chosen, unsure = np.zeros(n, dtype=int), np.zeros((count, n), dtype=bool)
     for j in range(n):
         changes = _changes_between(
-            [np.concatenate([part[:, j] for part in parts]) for parts in results]
+            [np.concatenate([part[:, j] for part in parts])[counts[:, j]] for parts in results]
         )
         k = _widest_window(changes, float(sigma[j]), filters)
         other = k - 1 if k else min(1, len(halves) - 1)
@@ -91,12 +102,26 @@ def differentiate(signal: Array, step: float, order: int, longest: float = MAX_R
         spread = max(float(sigma[j]), float(np.sqrt(variance)))
         noise[j] = spread * np.linalg.norm(filters[k])
         change = np.abs(of_window(other) - value[:, j])
-        typical = float(np.sqrt(np.mean(value[:, j] ** 2)))
+        typical = float(np.sqrt(np.mean(value[moves[:, j], j] ** 2)))
         unsure[:, j] = _jumps(change, typical, spread, filters[other], filters[k])
     return Derivative(value, noise, int(chosen.max(initial=3)), unsure)
 
 
-def _pieces(signal: Array) -> list[Array]:
+def moving_samples(q: Array, step: float) -> Mask:
+    """Return where (N, n) each joint moves; everywhere for one that hardly does.
+
+    ``q`` (N, n) rad, sampled every ``step`` s; N must be at least 3.
+    """
+    reach = max(min(round(SLOPE_REACH / step), (len(q) - 1) // 2), 1)
+    slope = np.empty(q.shape)
+    slope[reach:-reach] = np.abs(q[2 * reach :] - q[: -2 * reach])
+    slope[:reach], slope[-reach:] = slope[reach], slope[-reach - 1]
+    moves: Mask = slope > REST_SPEED * slope.max(axis=0)
+    moves[:, moves.sum(axis=0) < MIN_MOVING] = True
+    return moves
+
+
+def _pieces(signal: Sampled) -> list[Sampled]:
     """Return the pieces of a signal (N, n) used to choose the windows; a short one as a whole."""
     if len(signal) <= MAX_SAMPLES:
         return [signal]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gapbridge.core.arrays import Array, Index, Mask
-from gapbridge.core.derivatives import differentiate
+from gapbridge.core.derivatives import differentiate, moving_samples
 from gapbridge.core.errors import LogError
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
@@ -344,9 +344,10 @@ def _derivatives(
     step = float(grid[1] - grid[0])
     on_grid = q if uniform else _interpolated(t, q, grid)
     cached = measured_qd if uniform or measured_qd is None else _interpolated(t, measured_qd, grid)
-    speed = differentiate(on_grid, step, 1)
+    moves = moving_samples(on_grid, step)
+    speed = differentiate(on_grid, step, 1, moves=moves)
     for longest in WINDOWS:
-        qdd, unsure, edge = _accelerations(on_grid, cached, step, longest)
+        qdd, unsure, edge = _accelerations(on_grid, cached, step, longest, moves)
         valid: Mask = ~np.any(unsure, axis=1)
         if valid.mean() >= MIN_SMOOTH_SHARE:
             break
@@ -362,13 +363,13 @@ def _derivatives(
 
 
 def _accelerations(
-    q: Array, qd: Array | None, step: float, longest: float
+    q: Array, qd: Array | None, step: float, longest: float, moves: Mask
 ) -> tuple[Array, Mask, int]:
     """Return accelerations (N, n), where (N, n) they jump, and the rows to drop at either end."""
-    from_angles = differentiate(q, step, 2, longest)
+    from_angles = differentiate(q, step, 2, longest, moves)
     if qd is None:
         return from_angles.value, from_angles.unsure, from_angles.half_width
-    from_speeds = differentiate(qd, step, 1, longest)
+    from_speeds = differentiate(qd, step, 1, longest, moves)
     # from measured speeds, unless they are noisier than the angles; where the angles jump far more
     # often, their noise is not white (quantisation, vibration), and larger than estimated
     fewer_jumps = from_speeds.unsure.mean(axis=0) < FEWER_JUMPS * from_angles.unsure.mean(axis=0)

@@ -74,12 +74,16 @@ class Trial:
             os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
         if code not in (PASSED, FAILED):
             detail = f"pytest ended with {code}: {detail}"
-        elif code == FAILED and not self._are_sound(mutant.tests):
-            return Verdict(mutant, False, f"its tests fail without it too: {detail}")
+        elif code == FAILED and (failure := self._failure(mutant.tests)):
+            return Verdict(mutant, False, f"its tests fail without it too: {failure}")
         return Verdict(mutant, code == FAILED, detail)
 
-    def _are_sound(self, tests: tuple[str, ...]) -> bool:
-        """Return whether tests pass in the copy as it is."""
-        if tests not in self._pass and self.try_tests(tests)[0] == PASSED:
+    def _failure(self, tests: tuple[str, ...]) -> str:
+        """Return what fails in the copy as it is; empty where the tests pass."""
+        if tests in self._pass:
+            return ""
+        code, detail = self.try_tests(tests)
+        if code == PASSED:
             self._pass.add(tests)
-        return tests in self._pass
+            return ""
+        return detail

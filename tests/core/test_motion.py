@@ -103,6 +103,24 @@ def test_a_gap_in_time_ends_a_stretch():
     assert np.abs(motion.qd - COURSE.at(t[kept], 1))[motion.valid].max() < 0.01
 
 
+@pytest.mark.parametrize("rest", [slice(0, 3000), slice(5000, 8000)], ids=["before", "after"])
+def test_a_rest_costs_no_row_of_the_motion(rest):
+    """Encoders at rest do not flicker as in motion; what is moving chooses the windows."""
+    t = np.arange(8000) / 500
+    q = COURSE.at(np.arange(5000) / 500) + np.random.default_rng(0).normal(0, 3e-5, (5000, 6))
+    alone = motion_of(truth.log_of(6, timestamp=t[:5000], actual_q=q))
+    still = np.tile(q[0 if rest.start == 0 else -1], (3000, 1))
+    moved = slice(3000, 8000) if rest.start == 0 else slice(0, 5000)
+    whole = np.concatenate([still, q] if rest.start == 0 else [q, still])
+    motion = motion_of(truth.log_of(6, timestamp=t, actual_q=whole))
+    assert motion.valid[moved].sum() > 0.95 * alone.valid.sum()
+    assert motion.valid[rest].mean() > 0.9
+    assert np.abs(motion.qdd[rest][100:-100]).max() < 1e-9
+    good = motion.valid[moved] & alone.valid
+    error = (motion.qdd[moved] - alone.qdd)[good]
+    assert np.sqrt(np.mean(error**2)) < 0.05 * alone.qdd[good].std()
+
+
 def test_accelerations_come_from_speeds_where_those_of_the_angles_jump():
     """The angles' noise is not white: what two windows make of it differs."""
     t = np.arange(5000) / 500
