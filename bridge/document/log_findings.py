@@ -47,6 +47,8 @@ TEXTS = {
     "rotation vectors",
     LogCheck.TARGET_AXES: "the measured rotations differ by a constant {0:.2f} rad from the "
     "cell's tool: the target's axes are not those of tool.tcp",
+    LogCheck.TARGET_REMOUNTED: "the target's axes differ from session to session: if it was "
+    "remounted in between, add --remounted",
     LogCheck.MIRRORED: "they look mirrored (a left-handed frame, or two axes swapped)",
     LogCheck.INVERTED: "they look inverted: the base seen from the tool",
     LogCheck.JOINT_SIGN: "joint {0} seems to have the wrong sign",

@@ -29,7 +29,12 @@ from gapbridge.core.diagnosis.causes import Cause, Considered, causes_of, consid
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict, Where, locate
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
-from gapbridge.core.diagnosis.criteria import MIN_CONDITIONS, MIN_FREEDOM, UNRESOLVED
+from gapbridge.core.diagnosis.criteria import (
+    MAX_ARM_ERROR,
+    MIN_CONDITIONS,
+    MIN_FREEDOM,
+    UNRESOLVED,
+)
 from gapbridge.core.diagnosis.finding import (
     ChannelFinding,
     Fact,
@@ -280,6 +285,13 @@ def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFindi
         for finding in findings(part, session_model, metrology):
             sessions.setdefault(finding, []).append(name)
     log_findings = [replace(finding, sessions=tuple(names)) for finding, names in sessions.items()]
+    turned: dict[str, Any] = {
+        name: finding.values[0] for finding in log_findings for name in finding.sessions
+        if finding.check is LogCheck.TARGET_AXES
+    }  # fmt: skip
+    angles = [turned.get(name, 0.0) for name in log.session_names]
+    if np.ptp(angles) > MAX_ARM_ERROR and not metrology.remounted:
+        log_findings.append(LogFinding(LogCheck.TARGET_REMOUNTED))
     if not log.one_clock:
         log_findings.append(LogFinding(LogCheck.CLOCKS_OVERLAP))
     return log_findings + outside_findings(log)

@@ -44,7 +44,7 @@ from gapbridge.core.diagnosis.selection.smooth import KNOTS
 from gapbridge.core.diagnosis.selection.stiffness_curves import straight_curves
 from gapbridge.core.diagnosis.ties import ties_of
 from gapbridge.core.diagnosis.value_stability import (
-    links_close_gap,
+    links_explain_gap,
     links_predict_new_regions,
     shifts_alike,
     stable_effects,
@@ -118,25 +118,24 @@ def judge(selection: Selection, held_out: HeldOut) -> Judgement:
 def judge_geometry(
     selection: Selection, judgement: Judgement, arm: Arm
 ) -> tuple[Selection, Judgement]:
-    """Return selection and judgement with all links' geometry accused instead of single links.
+    """Return selection and judgement with all links' geometry accused, where it explains the gap.
 
-    It has to close the remaining gap in every part of the log, each held out of its fit.
+    It is tried where part of the geometry is suspected and structure is left.
     """
+    if selection.observation.channel != "position":
+        return selection, judgement
     accused_before = [selection.term_index[p] for p in judgement.accused]
     suspected = [*accused_before, *(selection.term_index[p] for p, _ in judgement.withdrawn)]
     shifts = shifts_alike(selection)
-    single = any(
-        selection.space.candidates[c].effect.estimated_as_whole
-        for c in suspected
-        if c not in shifts
-    )
-    if selection.block or not (single and judgement.structured):
+    effects = [selection.space.candidates[c].effect for c in suspected if c not in shifts]
+    geometric = any(e.estimated_as_whole or e.estimated_with_links for e in effects)
+    if selection.block or not (geometric and judgement.structured):
         return selection, judgement
     try:
         whole = selection.with_all_links(arm)
     except InputError:  # such an arm has no equilibrium
         return selection, judgement
-    if whole is None or not links_close_gap(whole, accused_before):
+    if whole is None or not links_explain_gap(whole, selection, accused_before):
         return selection, judgement
     second_judgement = judge(whole, HeldOut(whole))
     accused = {whole.term_index[p] for p in second_judgement.accused}
@@ -274,8 +273,8 @@ def significant_alone(
     """Return selection and judgement after the accused terms are refitted alone.
 
     With unnamed functions, and with covariances over the regions of the log, a value may be less
-    significant than before, and a stiffness curve linear. If all links are accused as a whole, at
-    least one of their terms must be significant, and no parameter implausible without being so.
+    significant than before, and a stiffness curve linear. If all links are accused as a whole, no
+    parameter may be implausible without being significant.
     What gained held out beside terms that are withdrawn here must gain without them.
     """
     start, complete = selection.terms, judgement.accused
@@ -289,11 +288,9 @@ def significant_alone(
             p: 0.0 if p in straight else worth(refit.terms[p], refit.covariance[p])
             for p in judgement.accused
         }
-        weakest = min(
-            refit.judged_together(judgement.accused),
-            key=lambda kind: max(significance[p] for p in kind), default=(),
-        )  # fmt: skip
-        if weakest and max(significance[p] for p in weakest) < 1:
+        alone = refit.judged_alone(judgement.accused)
+        weakest = tuple(sorted(alone, key=lambda p: significance[p])[:1])
+        if weakest and significance[weakest[0]] < 1:
             inside = refit.term_index[weakest[0]] in refit.block
             # friction that belongs to the links may be significant on more rows
             reason = NOT_SIGNIFICANT if inside else NOT_STABLE

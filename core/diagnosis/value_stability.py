@@ -23,6 +23,8 @@ from gapbridge.core.diagnosis.criteria import (
     DEGENERATE,
     DOMINANT_SHARE,
     EXTRA_PARAMETER_WEIGHT,
+    LINKS_GAIN,
+    LINKS_OVER_SET,
     MAX_SHARE_IN_UNNAMED,
     MAX_UNNAMED,
     MAX_VALUE_RATIO,
@@ -182,23 +184,22 @@ def closes_gap(selection: Selection, accused: Sequence[int]) -> bool:
     return _GapClosure(selection).closed(accused)
 
 
-def links_close_gap(selection: Selection, accused: Sequence[int]) -> bool:
-    """Return whether all links' geometry closes the accused effects' gap in every held-out part.
+def links_explain_gap(links: Selection, selection: Selection, accused: Sequence[int]) -> bool:
+    """Return whether all links' geometry (``links``) explains what the ``accused`` effects leave.
 
-    If the cause is not geometry, this happens in some part by chance, but not in all.
+    In regions that were not fitted it has to reduce the gap, and to leave hardly more than the set
+    that the search found, unnamed functions included: these describe what is not geometry better.
     """
-    part = parts(selection.observation, selection.kept)
-    held_out = HeldOut(selection, parts=part)
+    held_out, found = (
+        HeldOut(s, parts=parts(s.observation, s.kept)) for s in (links, selection)
+    )  # fmt: skip
     if not held_out.possible:
         return False
-    count = np.bincount(part)
-    candidates = selection.space.candidates
-    tool_point = [c for c in selection.best.chosen if candidates[c].effect.estimated_with_links]
-    residual, before = (
-        np.bincount(part, held_out.squares(c)) for c in ([*selection.block, *tool_point], accused)
-    )  # fmt: skip
-    alive = count > 0
-    return bool(np.all(residual[alive] < CLOSED_SHARE**2 * before[alive]))
+    candidates = links.space.candidates
+    tool_point = [c for c in links.best.chosen if candidates[c].effect.estimated_with_links]
+    whole = [*links.block, *tool_point]
+    gains = held_out.shrink(whole, accused).interval[0] > LINKS_GAIN
+    return gains and held_out.rms(whole) <= LINKS_OVER_SET * found.rms(selection.best.chosen)
 
 
 class _UnnamedFunctions:

@@ -33,6 +33,7 @@ class LogCheck(Enum):
     ROTATIONS_OFF = auto()  # median angle (rad)
     ROLL_PITCH_YAW = auto()
     TARGET_AXES = auto()  # angle (rad)
+    TARGET_REMOUNTED = auto()
     # mistakes that would explain positions that are far off
     MIRRORED = auto()
     INVERTED = auto()

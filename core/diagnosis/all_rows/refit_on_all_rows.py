@@ -163,8 +163,7 @@ def _significant(
 ) -> tuple[Selection, Judgement]:
     """Return selection and judgement with significant terms only; undecided ones need six sigmas.
 
-    Of the links, accused as a whole, one term at least has to be significant, and no parameter
-    implausible without being so.
+    Of the links, accused as a whole, no parameter may be implausible without being significant.
     """
     link_terms = {p for p in judgement.accused if p in selection.prior}  # three sigmas suffice
     square = (MIN_SIGMAS_WITH_UNNAMED / MIN_SIGMAS) ** 2
@@ -198,18 +197,14 @@ def _insignificant(
     linearised = None
     while True:
         left = [p for p in accused if p not in removed]
-        weak = [
-            kind for kind in selection.judged_together(left)
-            if max(strength[p] / least.get(p, 1.0) for p in kind) < 1
-        ]  # fmt: skip
+        weak = [p for p in selection.judged_alone(left) if strength[p] < least.get(p, 1.0)]
         if not weak:
             return removed
-        gains = [kind for kind in weak if any(_scales_reading(selection.terms[p]) for p in kind)]
+        gains = [p for p in weak if _scales_reading(selection.terms[p])]
         if gains:  # its joint's other values scale with it: first, and never to first order
-            return removed or list(gains[0])
-        at_zero = [kind for kind in weak if not any(strength[p] for p in kind)]
-        weakest = at_zero or [min(weak, key=lambda kind: max(strength[p] for p in kind))]
-        removed += [p for kind in weakest for p in kind]
+            return removed or gains[:1]
+        at_zero = [p for p in weak if not strength[p]]
+        removed += at_zero or [min(weak, key=lambda p: strength[p])]
         left = [p for p in left if p not in removed]
         linearised = linearised or refits.linearised(selection, accused)
         if linearised is None or not left:

@@ -13,6 +13,7 @@ from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
     LARGE_SAMPLE,
+    MAX_EXCESS_WITH_UNNAMED,
     MIN_SIGMAS,
     MIN_SIGMAS_WITH_UNNAMED,
     PRIOR_REACH,
@@ -30,7 +31,7 @@ from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.noise import Noise
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart, refit
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
-from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows
+from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows, flat
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.least_squares import projected_out, solve
 
@@ -72,15 +73,13 @@ class Selection:
         """Return the candidates of all links, where their geometry is a cause as a whole."""
         return tuple(self.prior)
 
-    def judged_together(self, positions: Sequence[int]) -> list[tuple[int, ...]]:
-        """Return positions of terms in groups, of each of which one term has to be significant.
+    def judged_alone(self, positions: Sequence[int]) -> list[int]:
+        """Return the positions of terms that have to be significant.
 
-        The links' geometry is one group, joint zeros included. All other terms, and each zero
-        again, are groups by themselves.
+        Not those of the links' geometry as a whole, which is judged by its gain in regions that
+        were not fitted.
         """
-        whole = tuple(p for p in positions if self._in_geometry(p))
-        single = [(p,) for p in positions if not self.is_link(p)]
-        return [*single, whole] if whole else list(single)
+        return [p for p in positions if not self.is_link(p)]
 
     def is_link(self, position: int) -> bool:
         """Return whether a term is a link's geometry, where all links are a cause."""
@@ -228,7 +227,8 @@ def refitted_alone(
 
     It begins from the terms ``start``, by default the selection's. In a short log the
     ``unnamed_part`` is fitted too, because the residual structure would bias the values. A long log
-    averages over it, and the functions would absorb the links' part.
+    averages over it, and the functions would absorb the links' part. Nor are the functions used
+    where they absorb a direction of the terms, whose values then leave more by themselves.
     """
     whole = len(accused) == len(selection.terms) and unnamed_part is None
     if not accused or (whole and not selection.nominal):
@@ -247,9 +247,13 @@ def refitted_alone(
     alone = fit(space, [c for c in chosen if c not in links])
     terms = selection.terms if start is None else start
     begin = {c: terms[p] for p, c in zip(accused, chosen, strict=True)}
-    state, fitted, index, spread, residual = refit(
-        state, selection.space, alone, links, unnamed_part, begin
-    )
+    result = refit(state, selection.space, alone, links, unnamed_part, begin)
+    if unnamed_part is not None and unnamed_part.columns.shape[1]:
+        plain = refit(state, selection.space, alone, links, unnamed_part.scatter_alone(), begin)
+        left, least = (float(np.sum(flat(r[-1][..., None], state) ** 2)) for r in (result, plain))
+        if left > MAX_EXCESS_WITH_UNNAMED**2 * least:
+            result = plain
+    state, fitted, index, spread, residual = result
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, term_covariance in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)

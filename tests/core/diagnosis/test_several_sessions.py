@@ -18,7 +18,7 @@ from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text
 from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.across_sessions import SessionTransfer, session_transfer
 from gapbridge.core.diagnosis.channels.position import observe
-from gapbridge.core.diagnosis.diagnosis import _slips, diagnose
+from gapbridge.core.diagnosis.diagnosis import _log_findings, _slips, diagnose
 from gapbridge.core.diagnosis.model_terms import terms_with_stand_ins
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.effects import Site, Term
@@ -26,7 +26,9 @@ from gapbridge.core.errors import LogError
 from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.metrology import Metrology
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 from gapbridge.core.sessions import join_sessions
 
 MODEL = small.model_of()
@@ -267,3 +269,26 @@ def test_the_model_with_stand_ins_has_the_final_causes_and_applies_steps_everywh
     (kept,) = terms_with_stand_ins([fitted], log)
     assert kept.effect == "joint_slip"
     assert kept.values[-1] < log.times()[0]
+
+
+@pytest.mark.parametrize(
+    ("turned", "remounted", "hinted"),
+    [((0.0, 0.3), False, True), ((0.3, 0.3), False, False), ((0.0, 0.3), True, False)],
+)
+def test_a_target_whose_axes_change_between_sessions_may_be_remounted(
+    turned: tuple[float, ...], remounted: bool, hinted: bool
+) -> None:
+    logs = []
+    for s, angle in enumerate(turned):
+        drawn = small.session_of(s, small.Plan(poses=20))
+        log = small.log_of(drawn, drawn.q)  # the positions follow
+        poses = MODEL.predict(log.columns["actual_q"], log.loads())
+        target = poses.rotation @ rotation_matrix(np.array([[0.0, 0.0, angle]]))[0]
+        columns = {
+            "measured_position": poses.position,
+            "measured_rotation": rotation_vector(target),
+        }
+        logs.append(replace(log, columns=log.columns | columns, path=f"{s}.csv"))
+    metrology = Metrology(registered=True, sigma=small.SIGMA, remounted=remounted)
+    found = _log_findings(MODEL, join_sessions(logs, MODEL), metrology)
+    assert (LogFinding(LogCheck.TARGET_REMOUNTED) in found) == hinted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import moving_truth as truth
 import numpy as np
@@ -27,7 +28,7 @@ from gapbridge.core.diagnosis.judgement import (
 from gapbridge.core.diagnosis.selection import rounds
 from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_requirement
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart, _cluster_covariance, worth
-from gapbridge.core.diagnosis.value_stability import links_close_gap, stable_effects
+from gapbridge.core.diagnosis.value_stability import links_explain_gap, stable_effects
 from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.metrology import Metrology
 
@@ -175,10 +176,30 @@ def test_all_links_are_accused_where_they_close_the_gap_everywhere(links):
     assert sorted(joints) == [1, 2]
 
 
+@pytest.mark.parametrize(
+    ("gain", "left", "explains"), [(0.31, 1.7, True), (0.29, 1.7, False), (0.31, 1.9, False)]
+)
+def test_links_explain_a_gap_only_if_unnamed_functions_do_it_hardly_better(
+    links, monkeypatch, gain, left, explains
+):
+    """A bent laser beam looks like links that close half the gap; as a function it is closed."""
+
+    def held_out(selection, parts):
+        return SimpleNamespace(
+            possible=True, shrink=lambda *_: SimpleNamespace(interval=(gain, 0.9)),
+            rms=lambda _: left if selection is whole else 1.0,
+        )  # fmt: skip
+
+    whole = replace(links)
+    monkeypatch.setattr(value_stability, "HeldOut", held_out)
+    assert links_explain_gap(whole, links, ()) == explains
+
+
 @pytest.mark.parametrize("effect", ["cross_coupling", "backlash"])
 def test_links_that_close_no_gap_are_not_accused(effect):
-    whole, judgement = fallen(small.diagnosed(effect).channels[0].selection)
-    assert not links_close_gap(whole, ())
+    found = small.diagnosed(effect).channels[0].selection
+    whole, judgement = fallen(found)
+    assert not links_explain_gap(whole, found, ())
     found, again = judge_geometry(replace(whole, prior={}), judgement, small.model_of().arm)
     assert again is judgement
     assert not found.block

@@ -100,10 +100,8 @@ class OnAllRows:
         self.space = SimpleNamespace(candidates=own)
 
     _in_geometry, is_link = Selection._in_geometry, Selection.is_link
-    judged_together, implausible_parameters = (
-        Selection.judged_together,
-        Selection.implausible_parameters,
-    )
+    judged_alone = Selection.judged_alone
+    implausible_parameters = Selection.implausible_parameters
 
     def with_nominal(self, numbers):
         (held,) = numbers.values()
