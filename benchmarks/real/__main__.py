@@ -27,6 +27,8 @@ SCALE = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "N": (1.0, "N"), "Nm": (1.0, "N
 @click.option("--command", default="gapbridge", show_default=True, help="The program to judge.")
 @click.option("--draw", type=int, default=0, show_default=True,
               help="Seed of the poses that are judged; of a recording it is its end.")  # fmt: skip
+@click.option("--poses", type=click.IntRange(5), default=None,
+              help="Fit so many random poses, and judge others.")  # fmt: skip
 @click.option("--stand-ins", "stand_ins", is_flag=True,
               help="Judge the model with stand-ins, not accusations alone.")  # fmt: skip
 @click.option("--json", "file", type=click.Path(path_type=Path), default=None,
@@ -38,6 +40,7 @@ def main(
     carried: bool,
     command: str,
     draw: int,
+    poses: int | None,
     stand_ins: bool,
     file: Path | None,
 ) -> None:
@@ -62,8 +65,9 @@ def main(
 
     program = Program(command, stand_ins)
     jobs: list[tuple[str, Iterable[Outcome]]] = []
-    jobs += [(name, judge_log(found[name], program, draw)) for name in found if chosen(name)]
-    for first in dict.fromkeys(a for a, _ in CARRIED) if carried else ():
+    jobs += [(name, judge_log(found[name], program, draw, poses))
+             for name in found if chosen(name)]  # fmt: skip
+    for first in dict.fromkeys(a for a, _ in CARRIED) if carried and poses is None else ():
         later = [found[b] for a, b in CARRIED
                  if a == first and {a, b} <= set(found) and chosen(f"{a} > {b}")]  # fmt: skip
         if later:

@@ -112,10 +112,18 @@ class Answer:
     seconds: float
 
 
-def judge_log(folder: Path, program: Program, draw: int = 0) -> Iterator[Outcome]:
-    """Yield the outcomes of one log: four fifths fitted, one fifth (drawn by a seed) judged."""
+def judge_log(
+    folder: Path, program: Program, draw: int = 0, poses: int | None = None
+) -> Iterator[Outcome]:
+    """Yield the outcomes of one log: four fifths fitted, one fifth (drawn by a seed) judged.
+
+    With ``poses`` so many are fitted and others judged. Raises ValueError where there are too few,
+    or the log is a recording.
+    """
     table = read_table(folder / "log.csv").with_approach()
-    fitted, judged = (table.rows(keep) for keep in halves(table, draw))
+    if poses is not None and (table.moving or len(table) < 2 * poses):
+        raise ValueError(f"found {len(table)} rows, expected at least {2 * poses} poses at rest")
+    fitted, judged = (table.rows(keep) for keep in halves(table, draw, poses))
     with tempfile.TemporaryDirectory(prefix="real-") as scratch:
         answer = _answer(folder, fitted, Path(scratch), program)
         yield from _judge(folder.name, answer, judged, program)

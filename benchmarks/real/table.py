@@ -17,6 +17,7 @@ from benchmarks.real import arms
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 MOVING = ("tracking", "torque")
+MOST_JUDGED = 400  # poses that judge a fit of a few others
 BUILT_IN = {"ur3e": arms.UR3E, "ur10e": arms.UR10E, "ur10": arms.UR10}
 
 
@@ -145,10 +146,19 @@ def copy_cell(source: Path, folder: Path) -> Path:
     return Path(shutil.copy(source, folder / "cell.yaml"))
 
 
-def halves(table: Table, seed: int = 0) -> tuple[Mask, Mask]:
-    """Return the rows to fit (four fifths) and to judge: the end of a recording, else at random."""
+def halves(table: Table, seed: int = 0, poses: int | None = None) -> tuple[Mask, Mask]:
+    """Return the rows to fit (four fifths) and to judge: the end of a recording, else at random.
+
+    With ``poses`` so many poses are fitted, and at most MOST_JUDGED of the others are judged.
+    """
     count = len(table)
     judged = np.zeros(count, dtype=bool)
+    if poses is not None:
+        order = np.random.default_rng(1000 + seed).permutation(count)
+        fitted = judged.copy()
+        fitted[order[:poses]] = True
+        judged[order[poses : poses + MOST_JUDGED]] = True
+        return fitted, judged
     if table.moving:
         judged[int(0.8 * count) :] = True
     else:

@@ -106,6 +106,9 @@ def test_a_recording_is_judged_on_its_end_and_poses_at_random():
     fitted, judged = halves(at_rest)
     assert judged.sum() == 10 and not (fitted & judged).any()
     assert np.ptp(judged.nonzero()[0]) > 15
+    fitted, judged = halves(at_rest, seed=1, poses=12)
+    assert fitted.sum() == 12 and judged.sum() == 38 and not (fitted & judged).any()
+    assert (fitted != halves(at_rest, seed=2, poses=12)[0]).any()
 
 
 @pytest.mark.parametrize(
