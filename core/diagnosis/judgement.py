@@ -402,8 +402,7 @@ def without_gain(selection: Selection, accused: Sequence[int], held_out: HeldOut
 def _by_effect(selection: Selection, chosen: Sequence[int]) -> dict[str, list[int]]:
     by_effect: dict[str, list[int]] = {}
     for c in chosen:
-        whole = c in selection.block
-        by_effect.setdefault("" if whole else selection.space.candidates[c].family, []).append(c)
+        by_effect.setdefault(selection.space.candidates[c].family, []).append(c)
     return by_effect
 
 

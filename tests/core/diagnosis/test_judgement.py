@@ -343,7 +343,9 @@ def test_each_joint_zero_of_the_links_has_to_be_significant(monkeypatch, offset,
         terms=terms, covariance=[1e-8 * np.eye(len(t.values)) for t in terms], term_index=(0, 1, 2),
         prior=dict.fromkeys(range(3), np.full(3, 5e-4)), block=(0, 1, 2),
         observation=SimpleNamespace(channel="position"),
-        space=SimpleNamespace(candidates=[SimpleNamespace(effect=e) for e in own]),
+        space=SimpleNamespace(
+            candidates=[SimpleNamespace(effect=e, family=e.identifier) for e in own]
+        ),
     )  # fmt: skip
     for name in ("_in_geometry", "is_link", "judged_alone", "implausible_parameters"):
         setattr(found, name, partial(getattr(Selection, name), found))
