@@ -320,9 +320,12 @@ def worth(term: Term, spread: Array) -> float:
     """Return the significance of a term with covariance (d, d); from 1 on it is significant.
 
     The smaller one of the whole term and of its most significant parameter. Of a periodic line
-    that is the amplitude; parameters of shape do not count.
+    that is the amplitude; parameters of shape do not count, but 0 is returned where one is not
+    identifiable: a Stribeck velocity of 10 +- 50 rad/s is Coulomb friction.
     """
     effect, value = CATALOGUE[term.effect], np.array(term.values[: len(spread)])
+    if effect.start_values and len(value) > 1 and spread[-1, -1] > value[-1] ** 2:
+        return 0.0
     whole = squared_sigmas(value, spread) / len(value)
     if effect.periodic:
         single = float(value @ value) ** 2 / max(float(value @ spread @ value), 1e-300)

@@ -15,9 +15,10 @@ from gapbridge.core.diagnosis.channels.position import observe
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import named_candidates, named_columns
 from gapbridge.core.diagnosis.selection.noise import estimate_noise
-from gapbridge.core.diagnosis.selection.refit import UnnamedPart, linearised_terms, refit
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart, linearised_terms, refit, worth
 from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
+from gapbridge.core.effects import Site, Term
 from gapbridge.core.metrology import Metrology
 
 MODEL = small.model_of()
@@ -215,3 +216,10 @@ def test_a_fit_without_a_term_to_first_order_is_the_refit_without_it(regions):
         for value, own, term, exactly in zip(values, spread, exact_terms, covariance, strict=True):
             assert abs(value[0] - term.values[0]) < 0.1 * np.sqrt(exactly[0, 0])
             assert own[0, 0] == pytest.approx(exactly[0, 0], rel=0.02)
+
+
+@pytest.mark.parametrize(("velocity", "sigma", "counts"), [(10.0, 50.0, False), (0.1, 0.02, True)])
+def test_friction_that_fades_at_no_speed_that_is_known_is_not_stribecks(velocity, sigma, counts):
+    """A UR10's joint 2: 17.3 +- 0.9 Nm and 10 +- 50 rad/s, which is Coulomb friction."""
+    term = Term("stribeck_friction", Site(2), (17.3, velocity))
+    assert (worth(term, np.diag([0.9, sigma]) ** 2) > 1) == counts
