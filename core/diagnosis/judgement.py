@@ -7,7 +7,7 @@ it reduces the gap on held-out samples. Remaining structure is reported, but wit
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -268,16 +268,18 @@ def _on_bound(parameter: Parameter, value: float, may_be_gone: bool) -> bool:
 
 
 def significant_alone(
-    selection: Selection, judgement: Judgement, held_out: HeldOut, arm: Arm
-) -> tuple[Selection, Judgement]:
+    selection: Selection, judgement: Judgement, arm: Arm,
+    held_out_of: Callable[[Selection], HeldOut] = HeldOut,
+) -> tuple[Selection, Judgement]:  # fmt: skip
     """Return selection and judgement after the accused terms are refitted alone.
 
     With unnamed functions, and with covariances over the regions of the log, a value may be less
     significant than before, and a stiffness curve linear. If all links are accused as a whole, no
     parameter may be implausible without being significant.
-    What gained held out beside terms that are withdrawn here must gain without them.
+    What gained held out beside terms that are withdrawn here must gain without them, and what
+    gained with a parameter that is held nominal here without it.
     """
-    start, complete = selection.terms, judgement.accused
+    start, complete, whole = selection.terms, judgement.accused, selection
     while True:
         refit = refitted_alone(selection, arm, judgement.accused, judgement.unnamed_part, start)
         if implausible := refit.implausible_parameters(judgement.accused):
@@ -296,8 +298,8 @@ def significant_alone(
             reason = NOT_SIGNIFICANT if inside else NOT_STABLE
         else:
             accused = [refit.term_index[p] for p in judgement.accused]
-            again = judgement.accused != complete
-            gainless = without_gain(refit, accused, held_out) if again else ()
+            again = judgement.accused != complete or selection is not whole
+            gainless = without_gain(refit, accused, held_out_of(refit)) if again else ()
             weakest = tuple(p for p in judgement.accused if refit.term_index[p] in gainless)
             if not weakest:
                 return refit, judgement
