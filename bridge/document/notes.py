@@ -84,12 +84,14 @@ TEXTS = {
     Reason.NO_STAMPS: "{0}: {1} of {2} messages have no stamp in their header; the time of "
     "recording is used instead",
     Reason.NO_TARGET: "target_q: no topic has it, so that tracking cannot be observed",
-    Reason.WRENCH_UNKNOWN: "{0}: left out; say what it measures with --wrench {1:or}",
-    Reason.POSE_UNNAMED: "{0}: left out; name the tracker's topic with --topic pose=TOPIC",
+    Reason.WRENCH_UNKNOWN: "{0}: left out; gapbridge convert takes it with --wrench {1:or}, which "
+    "says what it measures",
+    Reason.POSE_UNNAMED: "{0}: left out; gapbridge convert takes the tracker's with --topic "
+    "pose=TOPIC",
     Reason.NO_ROTATION: "{0}: orientation left out; {1} of {2} messages have none",
     Reason.TAKEN_AS: "{0}: taken as {1}, its axes are those of {2!r}",
-    Reason.EFFORT_UNKNOWN: "{0}: effort left out; where it is Nm (some drivers report A) say "
-    "--effort-is-torque",
+    Reason.EFFORT_UNKNOWN: "{0}: effort left out; where it is Nm (some drivers report A), "
+    "gapbridge convert takes it with --effort-is-torque",
     Reason.NO_COMMON_TIME: "{0}: shares no time with {1}, left out",
     Reason.GAPS: "{0}: {1} gaps, the longest {2:.3g} s",
     Reason.UNCOVERED: "{0} of {1} rows left out: not covered by every topic",

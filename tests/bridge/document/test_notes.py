@@ -39,3 +39,19 @@ def test_a_note_reads_as_a_sentence(note: Note) -> None:
 
 def test_every_reason_has_its_words() -> None:
     assert set(TEXTS) == set(Reason)
+
+
+@pytest.mark.parametrize(
+    ("reason", "values", "option"),
+    [
+        (Reason.EFFORT_UNKNOWN, ("/joint_states",), "--effort-is-torque"),
+        (Reason.WRENCH_UNKNOWN, ("/wrench", ("ft_raw_wrench",)), "--wrench ft_raw_wrench"),
+        (Reason.POSE_UNNAMED, ("/pose",), "--topic pose=TOPIC"),
+    ],
+)
+def test_what_a_source_leaves_out_is_taken_by_convert_which_alone_has_the_option(
+    reason: Reason, values: tuple[object, ...], option: str
+) -> None:
+    text = note_text(Note(reason, values))
+    assert "gapbridge convert takes" in text
+    assert option in text
