@@ -77,6 +77,8 @@ TEXTS = {
     "to the sensor (a mass at rest reads its weight, pointing down)",
     LogCheck.TORQUE_SIGN: "actual_current_as_torque seems to have the wrong sign; expected what "
     "the motors deliver",
+    LogCheck.GRAVITY: "the joint torques show weights that pull along {0:vector} m/s² of the base, "
+    "the cell's gravity is {1:vector}: is the base mounted as the cell says?",
     LogCheck.MISSING_FLEXIBILITY: "position: the cell has no joint flexibility, which hides other "
     "causes; a fit of {0} flexibilities alone (`gapbridge fit`) reduces the gap from {1:.3g mm} "
     "to {2:.3g mm} on held-out poses: fit first, then diagnose what remains",
@@ -131,6 +133,8 @@ class _Formatter(Formatter):
                 return READINGS[value]
             case "order":
                 return ", ".join(f"joint {i} is column _{k}" for i, k in value)
+            case "vector":
+                return f"[{', '.join(f'{x:.1f}' for x in value)}]"
             case "point":
                 return f"({', '.join(f'{1e3 * x:.0f}' for x in value)}) mm"
         if format_spec.endswith(" mm"):

@@ -1,0 +1,113 @@
+"""Log check for a base that is mounted otherwise than the cell's gravity says, by motor torques.
+
+Most of a torque is weight, which is linear in gravity. If another direction of about the same
+strength explains the torques much better, each joint's friction and a constant aside, the arm
+hangs on a wall or a ceiling, and the cell does not say so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gapbridge.core.arrays import Array, Index
+from gapbridge.core.diagnosis.criteria import MAX_SHARE_WITH_OTHER_SIGN
+from gapbridge.core.dynamics import predict_torque
+from gapbridge.core.estimation.least_squares import solve
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion
+
+MAX_ROWS = 200  # that are checked, evenly spaced
+MIN_ROWS = 30
+MIN_ANGLE = 0.35  # rad from the cell's gravity: no base is levelled worse
+STRENGTH = 0.7, 1.4  # times the cell's gravity: the links' masses are not exact
+MIN_TORQUE = 1.0  # Nm, rms of the weights' torque at the joint that bears most
+OPPOSITE = 2.6  # rad from the cell's gravity, from where torques of the wrong sign look alike
+MIN_SIGMAS = 3.0  # of the friction's sum, to tell a ceiling from torques of the wrong sign
+
+
+def mounting_findings(model: Model, log: Log) -> list[LogFinding]:
+    """Return the finding on a gravity that the motor torques contradict, if they do."""
+    torque, q = log.get("actual_current_as_torque"), log.get("actual_q")
+    if torque is None or q is None or log.has("actual_TCP_force") or not model.arm.mass.any():
+        return []
+    speed = log.get("actual_qd")
+    speed = np.gradient(q, axis=0) if speed is None and len(q) > 1 else speed
+    rows = _rows(q, torque, speed)
+    if speed is None or len(rows) < MIN_ROWS:
+        return []
+    weights = _weights(model, log, q, rows)
+    if np.sqrt(np.mean((weights @ model.gravity) ** 2, axis=0)).max() < MIN_TORQUE:
+        return []
+    gravity, before, after, friction = _fitted(model, weights, torque[rows], np.sign(speed[rows]))
+    strength = np.linalg.norm(gravity) / np.linalg.norm(model.gravity)
+    angle = _angle(gravity, model.gravity)
+    if (
+        after > MAX_SHARE_WITH_OTHER_SIGN * before
+        or not STRENGTH[0] < strength < STRENGTH[1]
+        or angle < MIN_ANGLE
+        or (angle > OPPOSITE and friction < MIN_SIGMAS)
+    ):
+        return []
+    return [LogFinding(LogCheck.GRAVITY, (tuple(map(float, gravity)), tuple(model.gravity)))]
+
+
+def _rows(*columns: Array | None) -> Index:
+    good = np.ones(len(columns[0]) if columns[0] is not None else 0, dtype=bool)
+    for column in columns:
+        if column is not None:
+            good &= np.isfinite(column).all(axis=1)
+    rows = np.flatnonzero(good)
+    take = np.linspace(0, max(len(rows) - 1, 0), MAX_ROWS).astype(int)
+    return rows[np.unique(take)] if len(rows) else rows
+
+
+def _weights(model: Model, log: Log, q: Array, rows: Index) -> Array:
+    """Return the static torques (N, n, 3) Nm per m/s² of gravity along each axis of the base."""
+
+    def some(name: str) -> Array | None:
+        column = log.get(name)
+        return None if column is None or not np.isfinite(column).all() else column[rows]
+
+    loads = Loads(payload_mass=some("payload"), payload_cog=some("payload_cog"), wrench=None)
+    at_rest = Motion.at_rest(q[rows], loads)
+    along = [predict_torque(replace(model, terms=(), gravity=axis), at_rest) for axis in np.eye(3)]
+    return np.stack(along, axis=2)
+
+
+def _fitted(
+    model: Model, weights: Array, torque: Array, way: Array
+) -> tuple[Array, float, float, float]:
+    """Return the gravity (3,) that fits, the rms with the cell's and with it, and the friction.
+
+    Rms of the joints' torques over their own scatter; the friction is the sum of all joints'
+    coefficients over its standard deviation.
+    """
+    count, n = torque.shape
+    scale = np.maximum(torque.std(axis=0), 1e-9)
+    own = np.zeros((count, n, 2 * n))
+    for j in range(n):
+        own[:, j, j], own[:, j, n + j] = way[:, j], 1.0
+    own = (own / scale[:, None]).reshape(count * n, 2 * n)
+    columns = (weights / scale[:, None]).reshape(count * n, 3)
+    measured = (torque / scale).ravel()
+    nominal = measured - columns @ model.gravity
+    before = nominal - own @ solve(own, nominal)
+    A = np.hstack([columns, own])
+    x = solve(A, measured)
+    after = measured - A @ x
+    variance = float(after @ after) / max(len(after) - A.shape[1], 1) * np.linalg.pinv(A.T @ A)
+    friction = slice(3, 3 + n)
+    spread = np.sqrt(max(float(variance[friction, friction].sum()), 1e-300))
+    return (
+        x[:3], float(np.sqrt(np.mean(before**2))), float(np.sqrt(np.mean(after**2))),
+        float(x[friction].sum()) / spread,
+    )  # fmt: skip
+
+
+def _angle(a: Array, b: Array) -> float:
+    return float(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1.0, 1.0)))
