@@ -77,6 +77,8 @@ TEXTS = {
     "to the sensor (a mass at rest reads its weight, pointing down)",
     LogCheck.TORQUE_SIGN: "actual_current_as_torque seems to have the wrong sign; expected what "
     "the motors deliver",
+    LogCheck.TORQUE_UNSIGNED: "actual_current_as_torque is never negative, though joints turn both "
+    "ways; expected torques with a sign, not their size (a hobby servo's current has none)",
     LogCheck.GRAVITY: "the joint torques show weights that pull along {0:vector} m/s² of the base, "
     "the cell's gravity is {1:vector}: is the base mounted as the cell says?",
     LogCheck.MISSING_FLEXIBILITY: "position: the cell has no joint flexibility, which hides other "

@@ -59,6 +59,7 @@ class LogCheck(Enum):
     PULL_SIGN_IN_TOOL = auto()
     WRENCH_SIGN = auto()
     TORQUE_SIGN = auto()
+    TORQUE_UNSIGNED = auto()
     GRAVITY = auto()  # what the torques show, that of the cell (m/s², base axes)
     # the model
     MISSING_FLEXIBILITY = auto()  # flexibilities, gap before and after their fit (m)

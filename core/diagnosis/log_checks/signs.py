@@ -1,4 +1,4 @@
-"""Log checks for forces of the wrong sign or in the wrong axes (docs/conventions.md).
+"""Log checks for forces of the wrong sign, without one or in the wrong axes (docs/conventions.md).
 
 An arm deflects in the direction of a force, and a sensor measures it. If the data agree much better
 with the force reversed, or in tool axes, the column has another convention.
@@ -28,6 +28,8 @@ MAX_ROWS = 200  # that are checked, evenly spaced
 MIN_ROWS = 6  # with a force, for a sign to be checked
 MIN_FORCE = 1.0  # N, Nm
 ROUNDS = 4
+MIN_JOINTS_UNSIGNED = 3  # that turn both ways: weights alone hold two at one sign
+MIN_SHARE_EACH_WAY = 0.05  # of the rows
 SENSORS = {
     "ft_raw_wrench": LogCheck.WRENCH_SIGN,
     "actual_current_as_torque": LogCheck.TORQUE_SIGN,
@@ -39,7 +41,7 @@ def sign_findings(model: Model, log: Log) -> list[LogFinding]:
     q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
     if q is None:
         return []
-    findings = []
+    findings = [LogFinding(LogCheck.TORQUE_UNSIGNED)] if _is_unsigned(log, q) else []
     for name, check in SENSORS.items():
         checked = name == "ft_raw_wrench" or model.arm.mass.any()
         if checked and _is_reversed(model, log, q, name):
@@ -161,6 +163,17 @@ def _by_sensor(name: str) -> Callable[[Model, Log, Array, Array], LogCheck | Non
         return _best(spread)
 
     return find
+
+
+def _is_unsigned(log: Log, q: Array) -> bool:
+    """Return whether torques are sizes: none is negative, whichever way the joints turn."""
+    torque = log.get("actual_current_as_torque")
+    if torque is None or len(q) < MIN_ROWS or not np.fmin.reduce(torque, axis=None) >= 0:
+        return False
+    step = np.diff(q, axis=0)
+    turns = np.minimum((step > 0).mean(axis=0), (step < 0).mean(axis=0)) > MIN_SHARE_EACH_WAY
+    pushed = np.fmax.reduce(torque, axis=0) > 0
+    return int((turns & pushed).sum()) >= MIN_JOINTS_UNSIGNED
 
 
 def _is_reversed(model: Model, log: Log, q: Array, name: str) -> bool:

@@ -1,4 +1,4 @@
-"""A base that is mounted otherwise than the cell's gravity says is reported by the weights."""
+"""A base that is not mounted as the cell says, and torques without a sign, are reported."""
 
 from __future__ import annotations
 
@@ -65,3 +65,10 @@ def test_a_few_rows_or_links_without_mass_show_no_mounting(moving):
     assert not [x for x in reported(model, truth.log_of(7, **few), WALL) if "weights" in x]
     massless = replace(model, arm=replace(model.arm, mass=np.zeros(7)))
     assert reported(massless, truth.log_of(7, **columns), WALL) == []
+
+
+def test_torques_without_a_sign_are_reported(moving):
+    model, columns = moving
+    sizes = columns | {"actual_current_as_torque": np.abs(columns["actual_current_as_torque"])}
+    line = reported(model, truth.log_of(7, **sizes), UPRIGHT)[0]
+    assert line.startswith("actual_current_as_torque is never negative,")
