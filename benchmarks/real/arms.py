@@ -117,6 +117,33 @@ ROKAE = _links(
     (0, -H, 0),
     (0, 0, 0.075, pi),
 )
+# Mecademic Meca500, product manual
+MECA500 = _links(
+    (0, -H, 0.135),
+    (0.135, 0, 0, -H),
+    (0.038, -H, 0),
+    (0, H, 0.12),
+    (0, -H, 0),
+    (0, 0, 0.07, pi),
+)
+# AUBO i5: lengths, masses and centres of gravity of the data set's own model
+AUBO_I5 = _links(
+    (0, -H, 0.122, pi, 5.05, (0, -0.0006, 0.0038)),
+    (0.408, pi, 0.1215, -H, 11.28, (-0.204, 0, -0.0196)),
+    (0.376, pi, 0, 0, 2.88, (-0.1061, 0, -0.0992)),
+    (0, -H, 0, -H, 1.62, (0, 0.078, -0.0997)),
+    (0, H, 0.1025, 0, 1.62, (0, -0.003, 0.0028)),
+    (0, 0, 0.094, 0, 0.5, (0, 0, -0.0442)),
+)
+# Doosan M1013 with a drilling tool of 3 kg on its last link: the data set's own URDF
+M1013 = _links(
+    (0, -H, 0.1525, 0, 7.8, (0.0001, 0.0064, 0.0428)),
+    (0.62, 0, 0.0345, -H, 10.83, (-0.3603, 0, 0.1579)),
+    (0, H, 0, H, 3.68, (0, 0.0447, 0.0067)),
+    (0, -H, 0.559, 0, 3.82, (0.0002, 0.1825, 0.0921)),
+    (0, H, 0, 0, 2.82, (-0.0002, 0.0323, -0.0037)),
+    (0, 0, 0.121, 0, 4.16, (0.0001, 0.0003, 0.1653)),
+)
 # three axes in one point: every attitude of a flange, where a data set gives attitudes, no joints
 WRIST = _links((0, -H, 0), (0, H, 0), (0, 0, 0))
 

@@ -1,12 +1,15 @@
 """Public data sets of real arms as logs and cells.
 
 ``python -m benchmarks.real.convert CHECKOUTS --out DIR``: CHECKOUTS holds clones of the sources
-under their own names (``git clone https://github.com/OWNER/NAME``); what is not there is skipped.
+under their own names (``git clone https://github.com/OWNER/NAME``; hanbyeolyoonucla's, a second
+``robot-calibration``, as ``meca500``); what is not there is skipped.
 None of these sets is part of this repository.
 """
 
 from __future__ import annotations
 
+import csv
+import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -46,11 +49,12 @@ class Source:
     repository: str  # owner/name on GitHub
     commit: str  # the one that was converted here
     make: Callable[[Path], Converted]
+    clone: str = ""  # its folder, where another source's has the same name
 
     @property
     def folder(self) -> str:
-        """Return the name of a plain clone."""
-        return self.repository.partition("/")[2]
+        """Return the name of the clone."""
+        return self.clone or self.repository.partition("/")[2]
 
 
 def _cell(links: tuple[arms.Link, ...], **more: Any) -> dict[str, Any]:
@@ -433,12 +437,189 @@ def _ur5e_motion(folder: Path) -> Converted:
     return Converted(columns, {"robot": {"model": "ur5e"}}, about)
 
 
+# -- Meca500, AUBO i5, Doosan M1013: positions -------------------------------------------------
+
+
+def _meca500(*names: str) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        raw = np.vstack([
+            np.loadtxt(folder / f"data_calibration/{name}_Output.csv", delimiter=",")
+            for name in names
+        ])  # fmt: skip
+        begins = np.r_[True, np.abs(np.diff(raw[:, :6], axis=0)).max(axis=1) > 0]
+        pose = np.cumsum(begins) - 1
+        count = np.bincount(pose)
+        position = np.column_stack([np.bincount(pose, x) / count for x in raw[:, 6:9].T])
+        about = {
+            "robot": "Mecademic Meca500", "files": ", ".join(names),
+            "instrument": "laser tracker, by its resolution: not named; means of three readings",
+        }  # fmt: skip
+        return _poses(arms.MECA500, np.deg2rad(raw[begins, :6]), position, 1e-5, about)
+
+    return make
+
+
+def _aubo(name: str, joints: str = "CAL", columns: int = 0) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        place = folder / "dataLib/kinematicsCalibrationData" / name
+
+        def numbers(file: str) -> Array:
+            lines = (place / file).read_text(encoding="utf-8").splitlines()
+            rows = [re.split(r"[,\s]+", line.strip()) for line in lines if line.strip()]
+            return np.array(rows, dtype=float)
+
+        number = joints.removeprefix("CAL")
+        q, measured = numbers(f"{joints}.txt"), numbers(f"mesurements{number}.txt")
+        q = np.deg2rad(q) if np.abs(q).max() > 2 * np.pi else q
+        position = measured[: len(q), columns : columns + 3] * 1e-3
+        point = rough_tool(arms.AUBO_I5, q, position)
+        about = {
+            "robot": "AUBO i5", "instrument": "Leica laser tracker", "file": name,
+            "timestamps": "only the order is known: 30 s steps were put in",
+            "tool": "the tool point is the best for the nominal arm, rounded to 1 mm",
+        }  # fmt: skip
+        columns_of_log = {
+            "timestamp": np.arange(len(q)) * 30.0, "actual_q": q, "measured_position": position,
+        }  # fmt: skip
+        cell = _cell(arms.AUBO_I5, tool=_tool(point), metrology=_tracker(2e-5))
+        return Converted(columns_of_log, cell, about)
+
+    return make
+
+
+def _aubo_torques(number: int) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        place = folder / "dataLib/dynamicCalibrationData/date_internal/torque_q_data"
+        q, qd, torque = (
+            np.loadtxt(place / f"aubo_{x}_{number}.txt") for x in ("q", "qd", "current")
+        )
+        columns = {
+            "timestamp": np.arange(len(q)) * 5e-3, "actual_q": q, "actual_qd": qd,
+            "actual_current_as_torque": torque,
+        }  # fmt: skip
+        about = {
+            "robot": "AUBO i5", "instrument": "motor currents as torques, 200 Hz, means of the "
+            "periods of an exciting motion of 10 s",
+        }  # fmt: skip
+        return Converted(columns, _cell(arms.AUBO_I5), about)
+
+    return make
+
+
+def _m1013(height: float, *names: str) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        rows = []
+        for number, name in enumerate(names):
+            text = (folder / f"data/datasets/{name}.yaml").read_text(encoding="utf-8")
+            stations = yaml.load(text, Loader=yaml.CSafeLoader)["column_heights"][height]
+            rows += [
+                (number, m["time"], *m["joint_states"][1:], *m["prism_position"])
+                for station in stations["solution_spaces"].values()
+                for measured in station.values() for m in measured
+            ]  # fmt: skip
+        raw = np.array(rows)
+        raw = raw[np.lexsort((raw[:, 1], raw[:, 0]))]
+        columns = {
+            "timestamp": raw[:, 1] - raw[0, 1],
+            "actual_q": raw[:, 2:8],
+            "measured_position": raw[:, 8:11],
+        }
+        columns |= {"session": raw[:, 0]} if len(names) > 1 else {}
+        about = {
+            "robot": f"Doosan M1013 on a lifting column at {height} m (Hilti JaiBot, prototype); "
+            "the column bends under the arm, and has play where it is high",
+            "instrument": "total station, 0.75 mm", "files": ", ".join(names),
+        }  # fmt: skip
+        cell = _cell(
+            arms.M1013, tool=_tool(np.array([-0.10091, -0.00102, 0.33566])),
+            gravity=[0.0, -9.80665, 0.0], metrology=_tracker(7.5e-4),
+        )  # fmt: skip
+        return Converted(columns, cell, about)
+
+    return make
+
+
+# -- UR10, Rokae AR5: torques; SO-101: tracking ------------------------------------------------
+
+
+def _ur10_bag(folder: Path) -> Converted:
+    import sqlite3
+
+    path = folder / "ur10_inverse_dynamics_solver/bagfiles/ur10_exciting_trajectory.db3"
+    messages = "select data from messages order by timestamp"
+    with sqlite3.connect(path) as bag:
+        # a JointState ends with three vectors of six numbers, each with its length before it
+        raw = np.array([np.frombuffer(m[-168:], "<f8") for (m,) in bag.execute(messages)])
+    columns = {
+        "timestamp": np.arange(len(raw)) * 8e-3,
+        "actual_q": raw[:, 1:7],
+        "actual_qd": raw[:, 8:14],
+        "actual_current_as_torque": raw[:, 15:21],
+    }
+    about = {"robot": "Universal Robots UR10 (CB series)",
+             "instrument": "motor currents times the drives' gains, 125 Hz"}  # fmt: skip
+    return Converted(columns, {"robot": {"model": "ur10"}}, about)
+
+
+def _ar5(folder: Path) -> Converted:
+    raw = np.loadtxt(folder / "src/config/dynamics_identification_data_real.csv", delimiter=",",
+                     skiprows=1)  # fmt: skip
+    columns = {
+        "timestamp": raw[:, 0],
+        "actual_q": raw[:, 1:8],
+        "actual_qd": raw[:, 8:15],
+        "actual_current_as_torque": raw[:, 22:29],
+    }
+    about = {
+        "robot": "Rokae AR5, seven axes", "instrument": "its own joint torques, 50 Hz",
+        "gravity": "along x of the base: not told, the weights show it (9.9 m/s², 0.7 Nm left)",
+        "model": "the data set's own URDF",
+    }  # fmt: skip
+    urdf = (folder / "urdf/AR5-5_07R-W4C4A2.urdf").read_text(encoding="utf-8")
+    return Converted(
+        columns, {"robot": {"urdf": "robot.urdf"}, "gravity": [9.80665, 0.0, 0.0]}, about, urdf
+    )
+
+
+def _so101(name: str) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        place = folder / "output/real/so101/custom" / name
+
+        def vectors(file: str, column: str) -> Array:
+            with (place / file).open(encoding="utf-8") as lines:
+                return np.array([json.loads(row[column]) for row in csv.DictReader(lines)])[:, :5]
+
+        time = np.loadtxt(place / "state_motor.csv", delimiter=",", skiprows=1, usecols=1) * 1e-6
+        columns = {
+            "timestamp": time - time[0],
+            "target_q": vectors("control.csv", "positions"),
+            "actual_q": vectors("state_motor.csv", "positions"),
+            "actual_qd": vectors("state_motor.csv", "velocities"),
+        }
+        about = {
+            "robot": "SO-101, Feetech STS3215 with a proportional gain of 16, no integral",
+            "instrument": "its servos, 50 Hz", "file": name,
+            "torques": "left out: the servos' currents have no sign",
+            "model": "github.com/TheRobotStudio/SO-ARM100, commit fda892c: its URDF, new zeros",
+        }  # fmt: skip
+        urdf = folder.parent / "SO-ARM100/Simulation/SO101/so101_new_calib.urdf"
+        cell = {"robot": {"urdf": "robot.urdf", "tip": "gripper_frame_link"}}
+        return Converted(columns, cell, about, urdf.read_text(encoding="utf-8"))
+
+    return make
+
+
 UR10E_SET = ("shamilmamedov/dynamic_calibration", "11af40e7deb758ec080a175fed8fcdd6c99aca29")
 IIWA_SET = ("Zhangzhongqiu/robot-calibration", "be44742b3b312bde09d87d9d40e89d8a634ac83b")
 MOTOMAN_SET = ("ctu-vras/multirobot-calibration", "a20f0454732bc36f1d980ff08c3d30536b8b1b19")
 KR300_SET = ("JonasWeigand/Robot_Identification", "9e403c07d9dadbb391a9f3921e8d219f714636a8")
 UR10_SET = ("christianlandgraf/ipa-robot-accuracy", "507fba69bdaf6c43c2faf306e70a7e37c5e39b89")
 STAUBLI_SET = ("ZhangTeng-Hust/ASTL", "e1ae9638bce784e778661322a89705a78514a006")
+MECA500_SET = ("hanbyeolyoonucla/robot-calibration", "33d50d777f1e182ddefb2774b054b090c6009ae7")
+AUBO_SET = ("ziyiyuan/MyRobot", "d49fbc03d1364436c826ac87de8a114fa9dd189f")
+M1013_SET = ("Hilti-Research/construction_robot_stationing_datasets",
+             "f26546d2f8fc8cf2adf619ffff69505126b0794e")  # fmt: skip
+SO101_SET = ("isaac-sim2real/sage", "4ffd2627df9d23e279b35712a67e629ce0c0dfa7")
 SOURCES: dict[str, Source] = {
     "ur10e_12harmonics": Source(*UR10E_SET, _ur10e("ur-20_02_10-30sec_12harm.csv", 635, 3510)),
     "ur10e_8harmonics": Source(*UR10E_SET, _ur10e("ur-20_02_05-20sec_8harm.csv", 320, 2310)),
@@ -479,6 +660,32 @@ SOURCES: dict[str, Source] = {
     "ur5e_motion": Source(
         "MingyuTang0728/Universal-Robots-Notts",
         "3bfbff1de97d4b82fdbc0203a44d85b33b3dd2fa", _ur5e_motion),
+    "meca500_right": Source(*MECA500_SET, _meca500(
+        "CAL00004_Right_Large160", "CAL00004_Right_Small80"), "meca500"),
+    "meca500_left": Source(*MECA500_SET, _meca500(
+        "CAL00005_Left_Large160", "CAL00005_Left_Small80"), "meca500"),
+    "aubo_i5_0101": Source(*AUBO_SET, _aubo("Leica0101")),
+    "aubo_i5_0706": Source(*AUBO_SET, _aubo("Leica_1", "CAL1")),
+    "aubo_i5_0917": Source(*AUBO_SET, _aubo("Leica0917")),
+    "aubo_i5_0918": Source(*AUBO_SET, _aubo("Leica0918", columns=3)),  # before: fitted values
+    "aubo_i5_0920": Source(*AUBO_SET, _aubo("Leica0920_1")),
+    "aubo_i5_0921": Source(*AUBO_SET, _aubo("Leica0921_1")),
+    "aubo_i5_0922": Source(*AUBO_SET, _aubo("Leica0922")),
+    **{f"aubo_i5_torques_{k}": Source(*AUBO_SET, _aubo_torques(k)) for k in (1, 2, 3)},
+    "m1013_low": Source(*M1013_SET, _m1013(1.98, "flat")),
+    "m1013_high": Source(*M1013_SET, _m1013(3.87, "flat")),
+    "m1013_high_on_pallet": Source(*M1013_SET, _m1013(3.87, "pallet")),
+    "m1013_seven_places": Source(*M1013_SET, _m1013(
+        1.98, "pallet", "flat", "orthogonal_wood", "wood_left_track", "diagonal_wood", "seesaw",
+        "outdoor")),
+    "ur10_excitation": Source(
+        "unisa-acg/inverse-dynamics-solver",
+        "41e196de5ca340f2b48e443484a7c74a77533da4", _ur10_bag),
+    "ar5": Source(
+        "FrankJIE09/Dynamics_identification_Frank",
+        "758dc8d6f78e63ecba0aac16d28255ae045f1d3c", _ar5),
+    **{f"so101_{name}": Source(*SO101_SET, _so101(name)) for name in (
+        "multisine", "random_waypoints", "large_amplitude", "backlash_detection")},
 }  # fmt: skip
 
 

@@ -43,7 +43,8 @@ CARRIED = (
     ("ipa_ur10_a", "ipa_ur10_b"), ("ipa_ur10_a", "ur10_c"), ("ipa_ur10_a", "ur10_d"),
     ("tsinghua_ur5_grid", "tsinghua_ur5_random"), ("barrett_wam_grid", "barrett_wam_random"),
     ("ur10e_12harmonics", "ur10e_50s"), ("ur10e_12harmonics", "ur10e_point_to_point"),
-    ("kr300_a", "kr300_b"),
+    ("kr300_a", "kr300_b"), ("meca500_right", "meca500_left"),
+    ("aubo_i5_0918", "aubo_i5_0921"), ("aubo_i5_torques_1", "aubo_i5_torques_2"),
 )  # fmt: skip
 REMOUNTED = {
     "iiwa_three_loads",

@@ -1,4 +1,6 @@
 import json
+import sqlite3
+import struct
 
 import numpy as np
 import pytest
@@ -164,6 +166,51 @@ def test_a_clone_becomes_a_log_and_a_cell(tmp_path):
     assert force == pytest.approx(np.tile([0, 0, -9.0], (9, 1)), abs=1e-6)
     about = yaml.safe_load((tmp_path / "out/ABOUT.yaml").read_text(encoding="utf-8"))
     assert source.repository in about["source"]
+
+
+def test_a_day_of_an_arm_becomes_a_log_in_metres_with_the_tool_that_suits_it(tmp_path):
+    source = SOURCES["aubo_i5_0918"]
+    place = tmp_path / source.folder / "dataLib/kinematicsCalibrationData/Leica0918"
+    place.mkdir(parents=True)
+    q = RNG.uniform(-1.5, 1.5, (30, 6))
+    p, R = arms.flange(arms.AUBO_I5, q)
+    measured = 1e3 * (p + R @ [-0.004, -0.009, 0.035] + [1.0, 2.0, 0.0])
+    np.savetxt(place / "CAL.txt", q, delimiter=",")
+    np.savetxt(place / "mesurements.txt", np.hstack([np.zeros((30, 3)), measured]), delimiter=",")
+    made = source.make(tmp_path / source.folder)
+    assert made.columns["measured_position"] == pytest.approx(measured / 1e3)
+    assert made.cell["tool"]["tcp"]["xyz"] == pytest.approx([-0.004, -0.009, 0.035])
+
+
+def test_readings_of_one_pose_become_one_row(tmp_path):
+    source = SOURCES["meca500_left"]
+    place = tmp_path / source.folder / "data_calibration"
+    place.mkdir(parents=True)
+    q = RNG.uniform(-1.5, 1.5, (20, 6))
+    p, R = arms.flange(arms.MECA500, q)
+    measured = np.repeat(p + R @ [-0.088, -0.001, 0.061], 3, axis=0)
+    measured += np.tile([[-3e-6], [0.0], [3e-6]], (20, 1))
+    rows = np.hstack([np.repeat(np.degrees(q), 3, axis=0), measured])
+    for size, part in (("Large160", rows[:30]), ("Small80", rows[30:])):
+        np.savetxt(place / f"CAL00005_Left_{size}_Output.csv", part, delimiter=",")
+    made = source.make(tmp_path / source.folder)
+    assert made.columns["actual_q"] == pytest.approx(q)
+    assert made.columns["measured_position"] == pytest.approx(measured[1::3])
+
+
+def test_a_bag_of_joint_states_becomes_columns(tmp_path):
+    source = SOURCES["ur10_excitation"]
+    path = tmp_path / "ur10_inverse_dynamics_solver/bagfiles/ur10_exciting_trajectory.db3"
+    path.parent.mkdir(parents=True)
+    values = RNG.normal(size=(4, 3, 6))
+    with sqlite3.connect(path) as bag:
+        bag.execute("create table messages (timestamp integer, data blob)")
+        for k, message in enumerate(values):
+            vectors = b"".join(struct.pack("<II6d", 6, 0, *vector) for vector in message)
+            bag.execute("insert into messages values (?, ?)", (k, b"head, names" + vectors))
+    columns = source.make(tmp_path).columns
+    for k, name in enumerate(("actual_q", "actual_qd", "actual_current_as_torque")):
+        assert columns[name] == pytest.approx(values[:, k])
 
 
 def test_sets_that_are_not_there_are_skipped_by_name(tmp_path):
