@@ -79,6 +79,8 @@ TEXTS = {
     "the motors deliver",
     LogCheck.TORQUE_UNSIGNED: "actual_current_as_torque is never negative, though joints turn both "
     "ways; expected torques with a sign, not their size (a hobby servo's current has none)",
+    LogCheck.CURRENTS: "actual_current_as_torque is only {0:.2f} times what the links weigh at "
+    "joints {1}: it looks like currents (A), expected torques (Nm)",
     LogCheck.GRAVITY: "the joint torques show weights that pull along {0:vector} m/s² of the base, "
     "the cell's gravity is {1:vector}: is the base mounted as the cell says?",
     LogCheck.MISSING_FLEXIBILITY: "position: the cell has no joint flexibility, which hides other "

@@ -60,6 +60,7 @@ class LogCheck(Enum):
     WRENCH_SIGN = auto()
     TORQUE_SIGN = auto()
     TORQUE_UNSIGNED = auto()
+    CURRENTS = auto()  # share of the weights, joints
     GRAVITY = auto()  # what the torques show, that of the cell (m/s², base axes)
     # the model
     MISSING_FLEXIBILITY = auto()  # flexibilities, gap before and after their fit (m)

@@ -151,15 +151,15 @@ def findings(
         return listed
     # imported here, because prediction only checks units
     from gapbridge.core.diagnosis.log_checks.frames import frame_findings
-    from gapbridge.core.diagnosis.log_checks.mounting import mounting_findings
     from gapbridge.core.diagnosis.log_checks.signs import sign_findings
+    from gapbridge.core.diagnosis.log_checks.weights import weight_findings
 
     listed += [*_limits(model, log), *_poses(log)]
     if not at_rest:
         listed += frame_findings(model, log, metrology or Metrology())
-    mounted = mounting_findings(model, log)
-    signs = [s for s in sign_findings(model, log) if not mounted or s.check != LogCheck.TORQUE_SIGN]
-    return listed + mounted + signs
+    weights = weight_findings(model, log)
+    signs = [s for s in sign_findings(model, log) if not weights or s.check != LogCheck.TORQUE_SIGN]
+    return listed + weights + signs
 
 
 class ColumnsAndOrder:

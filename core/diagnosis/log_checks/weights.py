@@ -1,8 +1,9 @@
-"""Log check for a base that is mounted otherwise than the cell's gravity says, by motor torques.
+"""Log checks by the links' weights, most of what motors hold: mounting and unit of the torques.
 
-Most of a torque is weight, which is linear in gravity. If another direction of about the same
-strength explains the torques much better, each joint's friction and a constant aside, the arm
-hangs on a wall or a ceiling, and the cell does not say so.
+Weights are linear in gravity. If another direction of about the same strength explains the torques
+much better, each joint's friction and a constant aside, the arm hangs on a wall or a ceiling, and
+the cell does not say so. If the torques are a small share of the weights at every joint that bears
+some, they are currents.
 """
 
 from __future__ import annotations
@@ -28,10 +29,13 @@ STRENGTH = 0.7, 1.4  # times the cell's gravity: the links' masses are not exact
 MIN_TORQUE = 1.0  # Nm, rms of the weights' torque at the joint that bears most
 OPPOSITE = 2.6  # rad from the cell's gravity, from where torques of the wrong sign look alike
 MIN_SIGMAS = 3.0  # of the friction's sum, to tell a ceiling from torques of the wrong sign
+BEARING = 5.0  # Nm, rms of the weights' torque at a joint, from which its share is known
+MIN_BEARING = 2  # joints
+CURRENTS = 0.02, 0.3  # A/Nm: 0.07 to 0.1 of UR arms; torques with any friction exceed 0.5
 
 
-def mounting_findings(model: Model, log: Log) -> list[LogFinding]:
-    """Return the finding on a gravity that the motor torques contradict, if they do."""
+def weight_findings(model: Model, log: Log) -> list[LogFinding]:
+    """Return the finding on a gravity, or a unit, that the motor torques contradict."""
     torque, q = log.get("actual_current_as_torque"), log.get("actual_q")
     if torque is None or q is None or log.has("actual_TCP_force") or not model.arm.mass.any():
         return []
@@ -43,7 +47,10 @@ def mounting_findings(model: Model, log: Log) -> list[LogFinding]:
     weights = _weights(model, log, q, rows)
     if np.sqrt(np.mean((weights @ model.gravity) ** 2, axis=0)).max() < MIN_TORQUE:
         return []
-    gravity, before, after, friction = _fitted(model, weights, torque[rows], np.sign(speed[rows]))
+    way = np.sign(speed[rows])
+    if currents := _currents(weights @ model.gravity, torque[rows], way):
+        return [currents]
+    gravity, before, after, friction = _fitted(model, weights, torque[rows], way)
     strength = np.linalg.norm(gravity) / np.linalg.norm(model.gravity)
     angle = _angle(gravity, model.gravity)
     if (
@@ -53,7 +60,9 @@ def mounting_findings(model: Model, log: Log) -> list[LogFinding]:
         or (angle > OPPOSITE and friction < MIN_SIGMAS)
     ):
         return []
-    return [LogFinding(LogCheck.GRAVITY, (tuple(map(float, gravity)), tuple(model.gravity)))]
+    return [
+        LogFinding(LogCheck.GRAVITY, tuple(tuple(map(float, g)) for g in (gravity, model.gravity)))
+    ]
 
 
 def _rows(*columns: Array | None) -> Index:
@@ -77,6 +86,24 @@ def _weights(model: Model, log: Log, q: Array, rows: Index) -> Array:
     at_rest = Motion.at_rest(q[rows], loads)
     along = [predict_torque(replace(model, terms=(), gravity=axis), at_rest) for axis in np.eye(3)]
     return np.stack(along, axis=2)
+
+
+def _currents(weight: Array, torque: Array, way: Array) -> LogFinding | None:
+    """Return the finding on torques (N, n) that are a small share of the weights' (N, n)."""
+    bearing = np.flatnonzero(np.sqrt(np.mean(weight**2, axis=0)) > BEARING)
+    shares = []
+    for j in bearing:
+        A = np.column_stack([weight[:, j], way[:, j]])
+        x = solve(A, torque[:, j])
+        left = float(np.sqrt(np.mean((torque[:, j] - A @ x) ** 2)))
+        if left > MAX_SHARE_WITH_OTHER_SIGN * float(np.sqrt(np.mean(torque[:, j] ** 2))):
+            return None
+        shares.append(float(x[0]))
+    if len(shares) < MIN_BEARING or not all(CURRENTS[0] < x < CURRENTS[1] for x in shares):
+        return None
+    return LogFinding(
+        LogCheck.CURRENTS, (float(np.median(shares)), tuple(int(j) + 1 for j in bearing))
+    )
 
 
 def _fitted(

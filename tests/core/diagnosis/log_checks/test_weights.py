@@ -1,4 +1,4 @@
-"""A base that is not mounted as the cell says, and torques without a sign, are reported."""
+"""A base that is not mounted as the cell says is reported, and currents or sizes for torques."""
 
 from __future__ import annotations
 
@@ -72,3 +72,12 @@ def test_torques_without_a_sign_are_reported(moving):
     sizes = columns | {"actual_current_as_torque": np.abs(columns["actual_current_as_torque"])}
     line = reported(model, truth.log_of(7, **sizes), UPRIGHT)[0]
     assert line.startswith("actual_current_as_torque is never negative,")
+
+
+def test_currents_are_reported_with_their_share_of_the_weights(moving):
+    model, columns = moving
+    currents = columns | {"actual_current_as_torque": columns["actual_current_as_torque"] / 12}
+    (line,) = reported(model, truth.log_of(7, **currents), UPRIGHT)
+    share = float(line.split("only ")[1].split()[0])
+    assert share == pytest.approx(1 / 12, rel=0.3)
+    assert line.endswith("it looks like currents (A), expected torques (Nm)")
