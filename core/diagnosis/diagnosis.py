@@ -357,7 +357,7 @@ def _search_and_refit(
     judgement = with_stand_ins(searched, judgement)
     stand_ins = _stand_ins(searched, judgement, held_out, model)
     before = judgement
-    searched, judgement = significant_alone(searched, judgement, model.arm)
+    searched, judgement = significant_alone(searched, judgement, held_out, model.arm)
     if judgement.accused != before.accused:
         judgement = with_structure_left(searched, judgement)
     without = (*withhold, *(c.effect for c in withdrawn))

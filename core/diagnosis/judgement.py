@@ -7,7 +7,7 @@ it reduces the gap on held-out samples. Remaining structure is reported, but wit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -268,9 +268,8 @@ def _on_bound(parameter: Parameter, value: float, may_be_gone: bool) -> bool:
 
 
 def significant_alone(
-    selection: Selection, judgement: Judgement, arm: Arm,
-    held_out_of: Callable[[Selection], HeldOut] = HeldOut,
-) -> tuple[Selection, Judgement]:  # fmt: skip
+    selection: Selection, judgement: Judgement, held_out: HeldOut, arm: Arm
+) -> tuple[Selection, Judgement]:
     """Return selection and judgement after the accused terms are refitted alone.
 
     With unnamed functions, and with covariances over the regions of the log, a value may be less
@@ -298,8 +297,10 @@ def significant_alone(
             reason = NOT_SIGNIFICANT if inside else NOT_STABLE
         else:
             accused = [refit.term_index[p] for p in judgement.accused]
-            again = judgement.accused != complete or selection is not whole
-            gainless = without_gain(refit, accused, held_out_of(refit)) if again else ()
+            if selection is not whole:
+                whole, held_out, complete = selection, HeldOut(refit), ()
+            again = judgement.accused != complete
+            gainless = without_gain(refit, accused, held_out) if again else ()
             weakest = tuple(p for p in judgement.accused if refit.term_index[p] in gainless)
             if not weakest:
                 return refit, judgement
@@ -404,7 +405,9 @@ def without_gain(selection: Selection, accused: Sequence[int], held_out: HeldOut
 def _by_effect(selection: Selection, chosen: Sequence[int]) -> dict[str, list[int]]:
     by_effect: dict[str, list[int]] = {}
     for c in chosen:
-        by_effect.setdefault(selection.space.candidates[c].family, []).append(c)
+        # first moments, friction and offsets of all joints gain together only
+        whole = c in selection.block and selection.observation.channel != "position"
+        by_effect.setdefault("" if whole else selection.space.candidates[c].family, []).append(c)
     return by_effect
 
 

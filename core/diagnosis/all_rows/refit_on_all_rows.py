@@ -203,8 +203,10 @@ def _insignificant(
         gains = [p for p in weak if _scales_reading(selection.terms[p])]
         if gains:  # its joint's other values scale with it: first, and never to first order
             return removed or gains[:1]
-        at_zero = [p for p in weak if not strength[p]]
-        removed += at_zero or [min(weak, key=lambda p: strength[p])]
+        # what came back for all rows to decide goes first, before what it replaces
+        doubtful = [p for p in weak if p in least] or weak
+        at_zero = [p for p in doubtful if not strength[p]]
+        removed += at_zero or [min(doubtful, key=lambda p: strength[p])]
         left = [p for p in left if p not in removed]
         linearised = linearised or refits.linearised(selection, accused)
         if linearised is None or not left:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import MIN_SIGMAS, PRIOR_REACH
+from gapbridge.core.diagnosis.criteria import EXTRA_PARAMETER_WEIGHT, MIN_SIGMAS, PRIOR_REACH
 from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian
 from gapbridge.core.diagnosis.selection.delay_columns import shrunk_to_common_delay
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace
@@ -326,7 +326,7 @@ def worth(term: Term, spread: Array) -> float:
     effect, value = CATALOGUE[term.effect], np.array(term.values[: len(spread)])
     if effect.start_values and len(value) > 1 and spread[-1, -1] > value[-1] ** 2:
         return 0.0
-    whole = squared_sigmas(value, spread) / len(value)
+    whole = squared_sigmas(value, spread) / (1 + EXTRA_PARAMETER_WEIGHT * (len(value) - 1))
     if effect.periodic:
         single = float(value @ value) ** 2 / max(float(value @ spread @ value), 1e-300)
     else:

@@ -298,7 +298,7 @@ def test_all_links_stay_a_cause_of_which_no_single_number_is_significant(monkeyp
         setattr(found, name, partial(getattr(Selection, name), found))
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
     given = Judgement((0, 1), False, None, (), {}, ())
-    assert significant_alone(found, given, None, lambda _: GAINING) == (found, given)
+    assert significant_alone(found, given, GAINING, None) == (found, given)
 
 
 @pytest.mark.parametrize(
@@ -351,7 +351,7 @@ def test_each_joint_zero_of_the_links_has_to_be_significant(monkeypatch, offset,
         setattr(found, name, partial(getattr(Selection, name), found))
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
     _, judgement = significant_alone(
-        found, Judgement((0, 1, 2), False, None, (), {}, ()), None, lambda _: GAINING
+        found, Judgement((0, 1, 2), False, None, (), {}, ()), GAINING, None
     )
     assert judgement.accused == stays
 
@@ -378,7 +378,7 @@ def test_what_gains_beside_a_withdrawn_term_only_is_withdrawn_too(
         possible=True, shrink=lambda *_: SimpleNamespace(interval=(low, 0.4))
     )
     given = Judgement((0, 1), False, None, (), {}, ())
-    _, judgement = significant_alone(found, given, None, lambda _: held_out)
+    _, judgement = significant_alone(found, given, held_out, None)
     assert judgement.accused == stays
     reasons = {p: why.failed for p, why in judgement.withdrawn}
     assert reasons.get(1) == (None if 1 in stays else Check.HELD_OUT_GAIN)
@@ -389,19 +389,20 @@ def test_links_that_gain_only_by_what_is_then_held_nominal_are_no_cause(monkeypa
     link = SimpleNamespace(effect=effect_named("link_geometry"), family="link_geometry")
     found = SimpleNamespace(
         terms=(Term("link_geometry", Site(2), (1e-3, 1e-3, 1e-3)),), covariance=[np.eye(3)],
-        term_index=(4,), block=(4,), judged_alone=lambda _: [], space=SimpleNamespace(
-            candidates={4: link}
-        ), implausible_parameters=lambda _: {4: [True]}, with_nominal=lambda _: held,
+        term_index=(4,), block=(4,), judged_alone=lambda _: [],
+        observation=SimpleNamespace(channel="position"),
+        space=SimpleNamespace(candidates={4: link}),
+        implausible_parameters=lambda _: {4: [True]}, with_nominal=lambda _: held,
     )  # fmt: skip
     held = SimpleNamespace(**vars(found) | {"implausible_parameters": lambda _: {}})
     monkeypatch.setattr(judging, "refitted_alone", lambda selection, *_: selection)
 
-    def held_out_of(selection):
-        low = 0.42 if selection is found else -0.03
-        return SimpleNamespace(possible=True, shrink=lambda *_: SimpleNamespace(interval=(low, 1)))
-
+    gainless = SimpleNamespace(
+        possible=True, shrink=lambda *_: SimpleNamespace(interval=(-0.03, 0.04))
+    )
+    monkeypatch.setattr(judging, "HeldOut", lambda _: gainless)
     given = Judgement((0,), True, None, (), {}, ())
-    _, judgement = significant_alone(found, given, None, held_out_of)
+    _, judgement = significant_alone(found, given, GAINING, None)
     assert judgement.accused == ()
 
 
@@ -430,9 +431,10 @@ def test_a_twist_far_outside_the_prior_has_to_be_significant(monkeypatch, spread
         return again
 
     found.with_nominal = with_nominal
+    monkeypatch.setattr(judging, "HeldOut", lambda _: GAINING)
     monkeypatch.setattr(judging, "refitted_alone", lambda selection, *_: selection)
     selection, judgement = significant_alone(
-        found, Judgement((0,), False, None, (), {}, ()), None, lambda _: GAINING
+        found, Judgement((0,), False, None, (), {}, ()), GAINING, None
     )
     assert selection is (again if held else found)
     assert requested == ([{4: [False, False, True]}] if held else [])

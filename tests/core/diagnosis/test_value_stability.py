@@ -303,12 +303,14 @@ def test_a_term_not_significant_with_unnamed_functions_is_withdrawn():
     found = small.diagnosed("backlash").channels[0].selection
     judgement = judge(found, HeldOut(found))
     arm = small.model_of().arm
-    assert significant_alone(found, judgement, arm)[1] is judgement
+    assert significant_alone(found, judgement, HeldOut(found), arm)[1] is judgement
     rows = len(found.space.y)
     # an unnamed function that does the very same as the accused
     twin = found.space.columns(found.term_index)
     unknown = UnnamedPart(twin, np.full(twin.shape[1], np.inf), np.arange(rows) // 3 % 20)
-    _, judged = significant_alone(found, replace(judgement, unnamed_part=unknown), arm)
+    _, judged = significant_alone(
+        found, replace(judgement, unnamed_part=unknown), HeldOut(found), arm
+    )
     assert judged.accused == ()
     assert with_structure_left(found, judged).structured
     assert [p for p, _ in judged.withdrawn] == [0]

@@ -226,3 +226,16 @@ def test_what_a_removal_makes_insignificant_is_removed_before_the_next_refit():
     _, decided = all_rows._significant(found, requested, refits)
     assert refitted_with == [(0, 3), (0,)]
     assert [p for p, _ in decided.withdrawn] == [2, 1, 3]
+
+
+def test_what_came_back_undecided_is_removed_before_what_it_replaces():
+    """A UR10's joint 2: Stribeck friction of 300 rows, and its Coulomb friction was gone."""
+    found = OnAllRows((0.0, 0.0, 0.0), (0.0,))
+    found.terms = tuple(Term("coulomb_friction", Site(j), (v,)) for j, v in ((1, 0.0), (2, 0.5)))
+    found.covariance, found.term_index, found.prior = [np.eye(1) * 1e-2] * 2, (0, 1), {}
+    own = [SimpleNamespace(effect=effect_named(t.effect)) for t in found.terms]
+    found.space = SimpleNamespace(candidates=own)
+    without_the_other = SimpleNamespace(alone=lambda _: ([np.ones(1)], [np.eye(1) * 1e-2]))
+    refits = SimpleNamespace(alone=lambda *_: found, linearised=lambda *_: without_the_other)
+    least = {1: 4.0}  # the second one is undecided: 5 sigmas of six
+    assert all_rows._insignificant(found, (0, 1), least, refits) == [1]
