@@ -25,14 +25,15 @@ SPLIT = {
     "barrett_wam_grid": TUNE, "barrett_wam_random": HELD_BACK,
     "iiwa_three_loads": TUNE, "iiwa_0kg": TUNE, "iiwa_month_before": HELD_BACK,
     "motoman_cube": TUNE, "motoman_wide": HELD_BACK, "irb120": HELD_BACK,
-    "tx2_calibration": TUNE, "tx2_points": HELD_BACK, "tx2_line": HELD_BACK,
+    "tx2_calibration": TUNE, "tx2_points": TUNE, "tx2_line": HELD_BACK,
     "tx2_curve": HELD_BACK, "tx2_surface": HELD_BACK, "irb120_position_only": TUNE,
     "rokae_30": HELD_BACK,
     "force_sensor_100": TUNE,
     "ur10e_12harmonics": TUNE, "ur10e_50s": TUNE, "ur10e_8harmonics": TUNE,
-    "ur10e_point_to_point": HELD_BACK, "rad_ur3e_rtde": TUNE, "panda": TUNE,
+    "ur10e_point_to_point": TUNE, "rad_ur3e_rtde": TUNE, "panda": TUNE,
     "ur5e_motion": TUNE, "tx40": TUNE,
-    "kr300_a": HELD_BACK, "kr300_b": HELD_BACK, "kr300_c": HELD_BACK,
+    "kr300_a": HELD_BACK, "kr300_b": HELD_BACK, "kr300_c": TUNE,
+    "ur10_excitation": TUNE, "aubo_i5_torques_1": TUNE, "m1013_high_on_pallet": TUNE,
 }  # fmt: skip
 PUBLISHED = {
     "tsinghua_ur5_grid > tsinghua_ur5_random": Published(0.1549e-3, "hybrid MDH and ASTGCN"),
