@@ -34,7 +34,7 @@ MIN_JUMP = 0.01  # of the derivative's rms: a smaller disagreement matters to no
 MAX_SAMPLES = 20_000  # samples beyond which evenly spread pieces of PIECE choose the windows
 PIECE = 2048
 REST_SPEED = 0.02  # of a joint's largest speed, below which it rests
-SLOPE_REACH = 0.1  # s either side, over which speeds are taken
+SPEED_REACH = 0.1  # s either side, over which speeds are taken
 MIN_MOVING = 100  # samples in motion, with fewer all are used
 
 
@@ -112,11 +112,11 @@ def moving_samples(q: Array, step: float) -> Mask:
 
     ``q`` (N, n) rad, sampled every ``step`` s; N must be at least 3.
     """
-    reach = max(min(round(SLOPE_REACH / step), (len(q) - 1) // 2), 1)
-    slope = np.empty(q.shape)
-    slope[reach:-reach] = np.abs(q[2 * reach :] - q[: -2 * reach])
-    slope[:reach], slope[-reach:] = slope[reach], slope[-reach - 1]
-    moves: Mask = slope > REST_SPEED * slope.max(axis=0)
+    reach = max(min(round(SPEED_REACH / step), (len(q) - 1) // 2), 1)
+    speed = np.empty(q.shape)
+    speed[reach:-reach] = np.abs(q[2 * reach :] - q[: -2 * reach]) / (2 * reach * step)
+    speed[:reach], speed[-reach:] = speed[reach], speed[-reach - 1]
+    moves: Mask = speed > REST_SPEED * speed.max(axis=0)
     moves[:, moves.sum(axis=0) < MIN_MOVING] = True
     return moves
 

@@ -572,7 +572,7 @@ def _ar5(folder: Path) -> Converted:
     }
     about = {
         "robot": "Rokae AR5, seven axes", "instrument": "its own joint torques, 50 Hz",
-        "gravity": "along x of the base: not told, the weights show it (9.9 m/s², 0.7 Nm left)",
+        "gravity": "along x of the base: not stated, the weights show it (9.9 m/s², 0.7 Nm left)",
         "model": "the data set's own URDF",
     }  # fmt: skip
     urdf = (folder / "urdf/AR5-5_07R-W4C4A2.urdf").read_text(encoding="utf-8")

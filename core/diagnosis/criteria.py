@@ -42,10 +42,8 @@ MIN_JOINTS_FOR_BLOCK = 3  # with a first moment, friction or zero each, from whi
 # with a flexibility: in 33 rows of a compliant arm the wrong links were accused
 LINKS_GAIN = 0.3  # lower end of what they gain over other effects in regions that were not fitted:
 # where links explain 30 to 100 poses of a UR5, a UR10, a TX2 or a Motoman it is at least 0.34
-LINKS_OVER_SET = (
-    1.8  # what they leave there over what the search's set leaves: these arms have 0.98
-)
-# to 1.74, unknown causes (a bent beam, a loose plate, a coupling) mostly 1.9 to 13
+LINKS_OVER_SET = 1.8  # what they leave there over what the search's set leaves: 0.98 to 1.74 of
+# these arms; unknown causes (a bent beam, a loose plate, a coupling) have mostly 1.9 to 13
 CLOSED_SHARE = 1 / 3  # of the gap that may remain beside several accused effects together, in parts
 # that were not fitted: an iiwa's tool and its flexibilities leave 0.24 to 0.27 in all, 0.33 to 0.41
 # in the worst part (either alone: 0.92 to 1.0); no other result of 161 cases changes
