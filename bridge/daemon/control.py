@@ -161,16 +161,34 @@ class Control:
         if problem := daemon.mark_problem:
             return refusal(problem)
 
-        def observes() -> bool:  # by the loop's own event, which comes after its state
-            return daemon.state == State.OBSERVING and not (daemon.latched or daemon.armed_by)
-
-        if self._wait_for(observes, SOURCE_SILENT if fault else LONGEST_RAMP):
+        if self._await_observing(SOURCE_SILENT if fault else LONGEST_RAMP):
             if observed:
                 return _done("is observing already")
             return _done(f"acknowledged ({fault}); observing" if fault else "observing")
         if fault:
             return _done(f"acknowledged ({fault}); observing as soon as the robot is fine")
+        if new := daemon.latched:
+            return refusal(
+                f"a fault has occurred since: {new}; acknowledge it as well: gapbridge disarm"
+            )
         return refusal(f"still {daemon.state.name.lower()} after {LONGEST_RAMP:g} s")
+
+    def _await_observing(self, limit: float) -> bool:
+        """Return whether it observes, by the loop's own event, which comes after its state.
+
+        A fault that stands ends the wait; a link's ends when it is connected again.
+        """
+        daemon, until = self._daemon, self._clock.monotonic() + limit
+        fault_at: float | None = None
+        while (now := self._clock.monotonic()) <= until:
+            if daemon.state == State.OBSERVING and not (daemon.latched or daemon.armed_by):
+                return True
+            in_fault = daemon.state == State.FAULT and daemon.latched
+            fault_at = (fault_at or now) if in_fault else None
+            if fault_at is not None and now - fault_at > SOURCE_SILENT:
+                break
+            self._clock.sleep(POLL_EVERY)
+        return False
 
     def _wait_for(self, what: Callable[[], bool], limit: float) -> bool:
         until = self._clock.monotonic() + limit

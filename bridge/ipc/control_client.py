@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from gapbridge.bridge.cell.runtime_folder import candidates, cell_key
 from gapbridge.core.errors import InputError, RunError, first_line
 
 ANSWER_TIMEOUT = 60.0  # s: a loop may have to restart, arming uploads a program to the robot
+CONNECT_TIMEOUT = 10  # s
+_TIMEVAL = struct.Struct("ll")  # s, us
 
 
 def ask(cell: Path, command: str) -> Any:
@@ -44,8 +47,10 @@ def ask(cell: Path, command: str) -> Any:
 def ask_socket(path: Path, command: str) -> Any:
     """Return the answer from a daemon's socket. Raises OSError, RunError."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
-        link.settimeout(ANSWER_TIMEOUT)
+        # connect waits for a place among many others; with settimeout it fails at once (unix(7))
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(CONNECT_TIMEOUT, 0))
         link.connect(str(path))
+        link.settimeout(ANSWER_TIMEOUT)
         link.sendall(json.dumps({"command": command}).encode() + b"\n")
         with link.makefile("rb") as file:
             line = file.readline()

@@ -25,7 +25,7 @@ from simulated_daemon import rides_on_a_program, until
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.cell.verification_mark import write_mark
 from gapbridge.bridge.daemon import control
-from gapbridge.bridge.ipc import control_socket
+from gapbridge.bridge.ipc import control_client, control_socket
 from gapbridge.bridge.ipc.control_client import ask, ask_socket, running
 from gapbridge.bridge.ipc.control_socket import ControlSocket, Peer
 from gapbridge.bridge.ipc.loop_state import State
@@ -182,17 +182,9 @@ def test_connections_that_say_nothing_keep_no_request_out(
     with contextlib.ExitStack() as stack:
         for _ in range(3 * control_socket.MAX_UNREAD):
             link = stack.enter_context(socket.socket(socket.AF_UNIX))
-            link.settimeout(PATIENCE)
-            wait_for(lambda link=link: connects(link, path), "a place among the waiting")
+            link.connect(str(path))  # waits for a place among those to be accepted
         for command in ("status", "disarm"):
             assert ask_socket(path, command) == command
-
-
-def connects(link: socket.socket, path: Path) -> bool:
-    with contextlib.suppress(BlockingIOError):  # too many wait to be accepted
-        link.connect(str(path))
-        return True
-    return False
 
 
 def test_requests_that_wait_for_their_answer_keep_no_disarm_out(tmp_path: Path) -> None:
@@ -222,7 +214,28 @@ def test_requests_that_wait_for_their_answer_keep_no_disarm_out(tmp_path: Path) 
         assert ask_socket(path, "status") == "status"
 
 
-def test_a_daemon_that_does_not_answer_is_not_taken_for_none(tmp_path: Path) -> None:
+def test_a_request_waits_for_a_place_among_the_connections(tmp_path: Path) -> None:
+    path = tmp_path / "x.sock"
+    with socket.socket(socket.AF_UNIX) as listener, socket.socket(socket.AF_UNIX) as other:
+        listener.bind(str(path))
+        listener.listen(0)
+        other.connect(str(path))
+        with ThreadPoolExecutor(1) as pool:
+            asked = pool.submit(ask_socket, path, "disarm")
+            with pytest.raises(TimeoutError):
+                asked.result(0.2)  # there is no place yet
+            with contextlib.ExitStack() as stack:
+                stack.enter_context(listener.accept()[0])
+                connection = stack.enter_context(listener.accept()[0])
+                connection.recv(100)
+                connection.sendall(b'{"ok": true, "answer": "observing"}\n')
+                assert asked.result(PATIENCE) == "observing"
+
+
+def test_a_daemon_that_does_not_answer_is_not_taken_for_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control_client, "CONNECT_TIMEOUT", 1)
     cell = tmp_path / "cell.yaml"
     cell.write_text("robot: {model: ur10e}\n")
     path = runtime_folder() / f"{cell_key(cell)}.sock"
@@ -292,6 +305,30 @@ def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then() -> None:
         run.link.controller.unlock()
         until(world, lambda: run.daemon.state == State.OBSERVING)
         until(world, lambda: run.daemon.status()["latched"] == "")
+
+
+def test_a_fault_after_a_request_to_disarm_is_named_at_once_and_not_acknowledged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with rides_on_a_program() as (run, world):
+        disarm = run.daemon.disarm
+
+        def disarm_just_before_a_stop(by: str) -> int:
+            number = disarm(by)
+            run.link.controller.protective_stop()
+            return number
+
+        begun = world.now
+        with monkeypatch.context() as patched:
+            patched.setattr(run.daemon, "disarm", disarm_just_before_a_stop)
+            refused = ask_in_simulation(run, "disarm")["error"]
+        assert "a fault has occurred since: robot not ready" in refused
+        assert "gapbridge disarm" in refused
+        assert world.now - begun < 3.0
+        assert run.daemon.latched
+        run.link.controller.unlock()
+        assert "acknowledged" in ask_in_simulation(run, "disarm")["answer"]
+        until(world, lambda: run.daemon.state == State.OBSERVING)
 
 
 @pytest.mark.slow

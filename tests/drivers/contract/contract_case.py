@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Self
@@ -34,14 +35,15 @@ class Case(ABC):
 
     resolution: half a count of the joint angles, rad; speed_resolution the same, None where the
     controller does not report speeds; clocked: whether it reports a time of its own, so that a
-    clock
-    that stands still can be noticed; force: half a count of the TCP force, N, None where there is
-    none; writes: ``offset``, ``joints`` or None.
+    clock that stands still can be noticed; torn_shows_within: s after the last whole sample in
+    which a torn one is no possible motion (infinite where the wire itself shows it); force: half a
+    count of the TCP force, N, None where there is none; writes: ``offset``, ``joints`` or None.
     """
 
     resolution = 1e-6
     speed_resolution: float | None = 1e-3
     clocked = False
+    torn_shows_within = math.inf
     force: float | None = None
     writes: str | None = "joints"
     state_timeout = 0.3

@@ -16,8 +16,9 @@ from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import UNITS
 from gapbridge.drivers.modbus.schema import Mailbox, Vector
 from gapbridge.drivers.modbus.settings import ModbusSettings
-from gapbridge.drivers.simulated.modbus.server import ModbusServer
+from gapbridge.drivers.simulated.modbus.server import TORN_APART, ModbusServer
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
+from gapbridge.drivers.state_check import VELOCITY_FACTOR
 
 INVENTED = Path(__file__).parents[1] / "modbus" / "invented.yaml"
 PORT = 15100  # each case has an address of its own
@@ -52,6 +53,9 @@ class ModbusCase(Case):
         mode = file.write.mode
         self.writes = {"mailbox": "offset", "target_trigger": "joints"}.get(mode)
         super().__init__()
+        if file.clock is None or file.clock.again is None:
+            fastest = VELOCITY_FACTOR * float(self.model.arm.limits.velocity.max())
+            self.torn_shows_within = TORN_APART / fastest
         self.settings = self.settings.model_copy(update={"host": self.host})
 
     def make_servers(self) -> list[ProtocolServer]:
