@@ -514,7 +514,8 @@ def _leaves_the_table(patch: Patch) -> None:
 
 
 def _answers_at_once(patch: Patch) -> None:
-    patch.setattr(Control, "_wait_for", lambda *_: True)
+    for name in ("_wait_for", "_await_observing"):
+        patch.setattr(Control, name, lambda *_: True)
 
 
 def _never_stops(patch: Patch) -> None:
