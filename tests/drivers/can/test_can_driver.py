@@ -104,11 +104,13 @@ def test_arming_enables_where_the_arm_stands_and_moves_nothing(served):
 
 def test_another_commander_on_the_bus_keeps_us_from_arming(served):
     bus = other_bus(served.settings)
-    bus.send(can.Message(arbitration_id=0x155, data=bytes(8), is_extended_id=False))
-    state = next_state(served.driver)
+    frame = can.Message(arbitration_id=0x155, data=bytes(8), is_extended_id=False)
+    task = bus.send_periodic(frame, 0.01)  # on a busy machine one would be too long ago
+    state = state_when(served, lambda _: served.driver.reader.foreign is not None)
     with pytest.raises(WriteError, match=r"another commander sent 0x155 .* two masters"):
         served.driver.arm(state)
     assert not any(served.nodes.enabled)
+    task.stop()
     time.sleep(served.settings.foreign_quiet)
     armed(served)
     bus.shutdown()

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import itertools
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import can
 import numpy as np
 from patience import PATIENCE
+from patient_drives import patient
 
 from benchmarks.server_thread import ServerThread
 from gapbridge.core.arm import builtin_arm
@@ -29,14 +32,20 @@ _numbers = itertools.count()
 
 
 class DriveArm:
-    """Six drives behind a profile, on python-can's virtual bus."""
+    """Six drives behind a profile, on python-can's virtual bus.
 
-    def __init__(self, profile: str = "cia402", **keys: Any) -> None:
+    ``is_patient``: heartbeats may be seconds late, where the profile is a shipped one.
+    """
+
+    def __init__(self, profile: str = "cia402", is_patient: bool = True, **keys: Any) -> None:
         chosen = {
             "interface": "virtual", "channel": f"drives{next(_numbers)}", "rate": 100.0,
             "state_timeout": 0.3, "listen": 0.05, "foreign_quiet": 0.1,
             "sdo_timeout": 5.0,  # of a busy machine
         }  # fmt: skip
+        if is_patient and not profile.endswith(".yaml"):
+            self._folder = tempfile.TemporaryDirectory(prefix="drives-")
+            profile = patient(profile, Path(self._folder.name))
         self.settings = CanopenSettings(profile=profile, **{**chosen, **keys})
         self.model = Model(builtin_arm("ur10e"))
         self.controller: ArmController = make_controller(
@@ -61,7 +70,7 @@ class DriveArm:
 
 @contextmanager
 def served(profile: str = "cia402", **keys: Any) -> Iterator[DriveArm]:
-    """Serve an arm while the block lasts."""
+    """Serve an arm while the block lasts; see DriveArm."""
     arm = DriveArm(profile, **keys)
     with arm.thread:
         yield arm

@@ -259,13 +259,12 @@ def test_a_lost_node_is_stale_and_named(generic: DriveArm, driver: CanopenDriver
         read_on(driver)
 
 
-def test_a_missing_heartbeat_is_stale_though_pdos_come(
-    generic: DriveArm, driver: CanopenDriver
-) -> None:
-    settled(driver)
-    generic.server.drives[1].nmt.stop_heartbeat()
-    with pytest.raises(StaleStateError, match=r"node 2: no heartbeat for 0\.3 s"):
-        read_on(driver)
+def test_a_missing_heartbeat_is_stale_though_pdos_come() -> None:
+    with served("cia402", is_patient=False) as arm, arm.driver() as driver:
+        settled(driver)
+        arm.server.drives[1].nmt.stop_heartbeat()
+        with pytest.raises(StaleStateError, match=r"node 2: no heartbeat for 0\.3 s"):
+            read_on(driver)
 
 
 def test_a_drive_that_restarts_is_a_lost_link(generic: DriveArm, driver: CanopenDriver) -> None:

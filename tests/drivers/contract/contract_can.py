@@ -14,6 +14,7 @@ from pathlib import Path
 from contract_case import Case
 
 from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.can.loading import read_profile
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.driver import Driver
@@ -62,6 +63,9 @@ class CanCase(Case):
         super().__init__()
         # both ends of the pty are in this busy process: a frame may take longer than a cell allows
         changes = {"host": self.host, "send_timeout": 10.0}
+        profile = read_profile(self.settings.profile_path, self.settings.installation)
+        if not (profile.ordered or profile.counted):  # else two cycles in one burst are like one
+            self.torn_shows_within = 3.0 / rate
         self.settings = self.settings.model_copy(update=changes)
 
     def make_servers(self) -> list[ProtocolServer]:

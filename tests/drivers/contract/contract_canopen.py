@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
+import tempfile
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from contract_case import Case
+from patient_drives import patient
 
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
@@ -32,9 +35,11 @@ class CanopenCase(Case):
         self, profile: str, interface: str, resolution: float, speed: float | None
     ) -> None:
         self.resolution, self.speed_resolution = resolution + 1e-9, speed
+        self._folder = tempfile.TemporaryDirectory(prefix="contract-")
         self.settings = CanopenSettings(
-            profile=profile, interface=interface, channel=f"contract{next(_channels)}", port=PORT,
-            rate=100.0, state_timeout=self.state_timeout, listen=0.05, foreign_quiet=0.2,
+            profile=patient(profile, Path(self._folder.name)), interface=interface,
+            channel=f"contract{next(_channels)}", port=PORT, rate=100.0,
+            state_timeout=self.state_timeout, listen=0.05, foreign_quiet=0.2,
             sdo_timeout=5.0,  # of a busy machine
         )  # fmt: skip
         super().__init__()
