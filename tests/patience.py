@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from typing import Any
+
+from gapbridge.core.errors import RunError
 
 PATIENCE = 120.0  # s
 
@@ -22,3 +25,22 @@ def wait_for(
         assert not late, f"{words() if callable(words) else words}: not within {within:g} s"
         time.sleep(0.01)
     return found
+
+
+def wait_for_error(read: Callable[[], object], kind: type[RunError], words: str) -> None:
+    """Read until an error of a kind says ``words`` (a regular expression).
+
+    Others may come before: a busy machine makes states late and tears them.
+    """
+    others = set[str]()
+
+    def said() -> bool:
+        try:
+            read()
+        except RunError as error:
+            if isinstance(error, kind) and re.search(words, str(error)):
+                return True
+            others.add(str(error))
+        return False
+
+    wait_for(said, lambda: f"{words} ({others or 'no error'})")

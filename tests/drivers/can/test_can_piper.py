@@ -86,8 +86,8 @@ def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, 
         wait_for(command, "the commanded joints")
         state = next_state(driver)
         assert state.target_q == pytest.approx(goal, abs=1e-5)  # another's, but heard
-        assert vendor.GetArmStatus().arm_status.ctrl_mode == 1
-        assert np.abs(joints_of(vendor) - goal).max() < 1e-4
+        wait_for(lambda: vendor.GetArmStatus().arm_status.ctrl_mode == 1, "the vendor's status")
+        wait_for(lambda: np.abs(joints_of(vendor) - goal).max() < 1e-4, "the vendor's joints")
 
 
 @pytest.mark.slow

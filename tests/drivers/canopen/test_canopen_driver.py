@@ -10,7 +10,7 @@ import can
 import numpy as np
 import pytest
 from drive_arm import DriveArm, follow, read_on, served, setpoint, settled
-from patience import PATIENCE, wait_for
+from patience import PATIENCE, wait_for, wait_for_error
 from ports import free_port
 
 from gapbridge.core.errors import (
@@ -197,8 +197,8 @@ def test_a_setpoint_that_is_not_finite_or_leaves_the_counts_is_refused(
 def test_a_set_without_one_drives_pdo_is_torn(generic: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
     generic.server.mute(node_of(generic, 3))
-    with pytest.raises(InvalidStateError, match=r"10 of 12 TPDOs, without TPDO1 of node 4"):
-        driver.read_state()
+    words = "10 of 12 TPDOs, without TPDO1 of node 4"
+    wait_for_error(driver.read_state, InvalidStateError, words)
     generic.server.unmute()
     settled(driver)
 
@@ -255,16 +255,14 @@ def test_frames_of_others_are_no_samples(
 def test_a_lost_node_is_stale_and_named(generic: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
     generic.server.mute(node_of(generic, 4))
-    with pytest.raises(StaleStateError, match="node 5"):
-        read_on(driver)
+    wait_for_error(driver.read_state, StaleStateError, "node 5")
 
 
 def test_a_missing_heartbeat_is_stale_though_pdos_come() -> None:
     with served("cia402", is_patient=False) as arm, arm.driver() as driver:
         settled(driver)
         arm.server.drives[1].nmt.stop_heartbeat()
-        with pytest.raises(StaleStateError, match=r"node 2: no heartbeat for 0\.3 s"):
-            read_on(driver)
+        wait_for_error(driver.read_state, StaleStateError, r"node 2: no heartbeat for 0\.3 s")
 
 
 def test_a_drive_that_restarts_is_a_lost_link(generic: DriveArm, driver: CanopenDriver) -> None:
