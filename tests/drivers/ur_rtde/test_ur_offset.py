@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from textwrap import dedent
 
 import numpy as np
@@ -194,7 +195,8 @@ def test_a_wrong_checksum_moves_nothing_and_is_reported(offset_robot: SimulatedC
         """,
     )
     assert "offsets do not arrive" in str(out["error"])
-    assert "REJECTED" in str(out["error"])
+    # the program's last word: on a busy machine it also waits in vain for a right one
+    assert re.search("says (REJECTED|EXPIRED)", str(out["error"]))
     assert out["applied"] == [0] * 6
 
 
