@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-import struct
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,7 @@ from gapbridge.bridge.cell.runtime_folder import candidates, cell_key
 from gapbridge.core.errors import InputError, RunError, first_line
 
 ANSWER_TIMEOUT = 60.0  # s: a loop may have to restart, arming uploads a program to the robot
-CONNECT_TIMEOUT = 10  # s
-_TIMEVAL = struct.Struct("ll")  # s, us
+CONNECT_TRIES, RETRY = 1000, 0.01  # s between two: for a place among the daemon's connections
 
 
 def ask(cell: Path, command: str) -> Any:
@@ -47,10 +46,8 @@ def ask(cell: Path, command: str) -> Any:
 def ask_socket(path: Path, command: str) -> Any:
     """Return the answer from a daemon's socket. Raises OSError, RunError."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
-        # connect waits for a place among many others; with settimeout it fails at once (unix(7))
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(CONNECT_TIMEOUT, 0))
-        link.connect(str(path))
         link.settimeout(ANSWER_TIMEOUT)
+        _connect(link, path)
         link.sendall(json.dumps({"command": command}).encode() + b"\n")
         with link.makefile("rb") as file:
             line = file.readline()
@@ -61,6 +58,15 @@ def ask_socket(path: Path, command: str) -> Any:
     if not reply.get("ok"):
         raise RunError(str(reply.get("error", "refused")))
     return reply.get("answer")
+
+
+def _connect(link: socket.socket, path: Path) -> None:
+    """Connect as soon as there is a place. Raises OSError."""
+    for _ in range(CONNECT_TRIES):
+        with contextlib.suppress(BlockingIOError):  # at once where there is none (unix(7))
+            return link.connect(str(path))
+        time.sleep(RETRY)
+    return link.connect(str(path))
 
 
 def running() -> list[Any]:

@@ -235,7 +235,7 @@ def test_a_request_waits_for_a_place_among_the_connections(tmp_path: Path) -> No
 def test_a_daemon_that_does_not_answer_is_not_taken_for_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(control_client, "CONNECT_TIMEOUT", 1)
+    monkeypatch.setattr(control_client, "CONNECT_TRIES", 10)
     cell = tmp_path / "cell.yaml"
     cell.write_text("robot: {model: ur10e}\n")
     path = runtime_folder() / f"{cell_key(cell)}.sock"

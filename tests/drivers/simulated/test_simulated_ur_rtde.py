@@ -20,9 +20,12 @@ def test_receive_reads_the_whole_default_recipe(controller: SimulatedController)
         out["raw"] = r.getFtRawWrench()
         out["temperatures"] = r.getJointTemperatures()
         out["mode"] = [r.getRobotMode(), r.getSafetyMode(), r.getRuntimeState()]
-        first, begun = r.getTimestamp(), time.monotonic()
-        until(lambda: r.getTimestamp() - first > 0.5)
-        out["slower"] = time.monotonic() - begun - (r.getTimestamp() - first)
+        slower = []
+        for _ in range(5):  # a busy machine holds some of them up
+            first, begun = r.getTimestamp(), time.monotonic()
+            until(lambda: r.getTimestamp() - first > 0.5)
+            slower.append(time.monotonic() - begun - (r.getTimestamp() - first))
+        out["slower"] = sorted(slower)[2]
         out["connected"] = r.isConnected()
         """,
     )
@@ -249,8 +252,9 @@ def test_a_starved_watchdog_stops_the_program(controller: SimulatedController) -
         controller.host,
         CONTROL
         + """
-c.setWatchdog(2.0)
-for _ in range(35):
+c.setWatchdog(0.5)  # 2 s: a busy machine kicks later than it means to
+begun = time.monotonic()
+while time.monotonic() - begun < 2.5:
     c.kickWatchdog()
     time.sleep(0.02)
 out["fed"] = r.getRuntimeState()
