@@ -59,7 +59,7 @@ class Plc:
 
 @pytest.fixture
 def source() -> Iterator[ModbusSource]:
-    settings = SetpointSettings(source="modbus", port=0, timeout=0.3)
+    settings = SetpointSettings(source="modbus", port=0, timeout=1.0)
     made = make_source(settings, 3, True, Path(), clock=SYSTEM)
     assert isinstance(made, ModbusSource)
     made.open()
@@ -101,7 +101,7 @@ def test_a_plc_that_falls_silent_is_dry(source: ModbusSource) -> None:
     plc.put(HERE)
     first_of(source)
     source.begin(0.0, HERE)
-    time.sleep(0.4)
+    time.sleep(1.1)
     with pytest.raises(SourceDryError, match="found no new sequence number for"):
         source.sample(0.0, HERE)
 
