@@ -27,20 +27,20 @@ def wait_for(
     return found
 
 
-def wait_for_error(read: Callable[[], object], kind: type[RunError], words: str) -> None:
-    """Read until an error of a kind says ``words`` (a regular expression).
+def wait_for_error(read: Callable[[], object], kind: type[RunError], words: str) -> str:
+    """Read until an error of a kind says ``words`` (a regular expression), and return its text.
 
     Others may come before: a busy machine makes states late and tears them.
     """
     others = set[str]()
 
-    def said() -> bool:
+    def said() -> str:
         try:
             read()
         except RunError as error:
             if isinstance(error, kind) and re.search(words, str(error)):
-                return True
+                return str(error)
             others.add(str(error))
-        return False
+        return ""
 
-    wait_for(said, lambda: f"{words} ({others or 'no error'})")
+    return str(wait_for(said, lambda: f"{words} ({others or 'no error'})"))

@@ -174,8 +174,9 @@ class Run:
             now = time.monotonic()
             assert self.error is None, self.error
             assert now < until, f"{self.daemon.state} ({self.output}): not within {PATIENCE:g} s"
-            if now - asked > 3.0 and self.daemon.state in (State.OBSERVING, State.FAULT):
-                (self.daemon.arm if self.daemon.state == State.OBSERVING else self.daemon.disarm)()
+            late = any(words in self.daemon.latched for words in LATE)
+            if now - asked > 3.0 and (self.daemon.state == State.OBSERVING or late):
+                (self.daemon.disarm if late else self.daemon.arm)()
                 asked = now
             time.sleep(0.002)
 

@@ -255,7 +255,7 @@ def test_a_stop_that_comes_and_goes_while_frames_make_no_sample_is_reported_once
 def test_status_that_falls_silent_while_joints_go_on_is_stale(served):
     served.nodes.withheld.add(0x2A1)
     next_state(served.driver)
-    wait_for_error(served.driver.read_state, StaleStateError, "no ArmStatus for 1 s")
+    assert wait_for_error(served.driver.read_state, StaleStateError, "no ArmStatus for 1 s")
 
 
 def test_joints_that_stand_still_though_commanded_away_are_stale(served):
@@ -263,7 +263,7 @@ def test_joints_that_stand_still_though_commanded_away_are_stale(served):
     served.controller.frozen = True  # the same joints again and again
     goal = state.actual_q + 0.04
     served.driver.write_setpoint(setpoint_of(goal))
-    wait_for_error(served.driver.read_state, StaleStateError, "joints have not changed")
+    assert wait_for_error(served.driver.read_state, StaleStateError, "joints have not changed")
 
 
 def test_a_lost_frame_costs_its_sample_and_is_reported(served):

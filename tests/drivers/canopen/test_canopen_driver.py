@@ -198,7 +198,7 @@ def test_a_set_without_one_drives_pdo_is_torn(generic: DriveArm, driver: Canopen
     settled(driver)
     generic.server.mute(node_of(generic, 3))
     words = "10 of 12 TPDOs, without TPDO1 of node 4"
-    wait_for_error(driver.read_state, InvalidStateError, words)
+    assert wait_for_error(driver.read_state, InvalidStateError, words)
     generic.server.unmute()
     settled(driver)
 
@@ -255,14 +255,16 @@ def test_frames_of_others_are_no_samples(
 def test_a_lost_node_is_stale_and_named(generic: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
     generic.server.mute(node_of(generic, 4))
-    wait_for_error(driver.read_state, StaleStateError, "node 5")
+    assert wait_for_error(driver.read_state, StaleStateError, "node 5")
 
 
 def test_a_missing_heartbeat_is_stale_though_pdos_come() -> None:
     with served("cia402", is_patient=False) as arm, arm.driver() as driver:
         settled(driver)
         arm.server.drives[1].nmt.stop_heartbeat()
-        wait_for_error(driver.read_state, StaleStateError, r"node 2: no heartbeat for 0\.3 s")
+        assert wait_for_error(
+            driver.read_state, StaleStateError, r"node 2: no heartbeat for 0\.3 s"
+        )
 
 
 def test_a_drive_that_restarts_is_a_lost_link(generic: DriveArm, driver: CanopenDriver) -> None:
