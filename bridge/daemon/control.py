@@ -124,9 +124,9 @@ class Control:
         mark = daemon.sequence
         if not daemon.arm(by):
             return refusal("the loop has ended, expected one that observes")
-        return self._await_armed(mark)
+        return self._await_armed(mark, by)
 
-    def _await_armed(self, mark: int) -> dict[str, Any]:
+    def _await_armed(self, mark: int, by: str) -> dict[str, Any]:
         daemon, begun, waiting = self._daemon, self._clock.monotonic(), None
         while self._clock.monotonic() - begun < LONGEST_ARMING:
             for event in daemon.events_since(mark):
@@ -144,7 +144,10 @@ class Control:
             if waiting is not None and self._clock.monotonic() - waiting > SOURCE_SILENT:
                 return _done("armed; waits for the first setpoint of its source")
             self._clock.sleep(POLL_EVERY)
-        return refusal(f"no answer of the loop within {LONGEST_ARMING:g} s")
+        daemon.disarm(by)  # else it may arm later, when nobody expects it any more
+        return refusal(
+            f"no answer of the loop within {LONGEST_ARMING:g} s; the request is withdrawn"
+        )
 
     def _disarm(self, by: str) -> dict[str, Any]:
         """Request it in any state, and answer what a loop has confirmed."""

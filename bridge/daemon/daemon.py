@@ -250,9 +250,10 @@ class Daemon:
         ``duration``, s, counts from the first cycle of the run, also through lost links.
         """
         with ExitStack() as stack:
-            arm = self._open(stack, arm, by)
+            arm, since = self._open(stack, arm, by), 0
             while not self._stopping.is_set():
-                self._run_loop((by or PROGRAM) if arm else "", duration)
+                self._run_loop((by or PROGRAM) if arm else "", since, duration)
+                since = self._requests.forward_all()  # what has come by now ends a reload's arming
                 swap = self._reload.swap()
                 self._take_configuration(swap.configuration or self.configuration)
                 arm = swap.rearms  # otherwise only a person can arm again
@@ -342,12 +343,12 @@ class Daemon:
         if loop is None or not loop.hangs:
             self.manager.kick()
 
-    def _run_loop(self, armed_by: str, duration: float | None) -> None:
-        """Run one process of the loop to its end; ``armed_by``: who lets it arm at its start."""
+    def _run_loop(self, armed_by: str, since: int, duration: float | None) -> None:
+        """Run one process of the loop to its end; see _start_loop."""
         self._last_state = State.DISCONNECTED
         self._failure = {}
         try:
-            loop = self.loop = self._start_loop(armed_by)
+            loop = self.loop = self._start_loop(armed_by, since)
         except OSError as error:  # memory, processes or descriptors are short
             self._on_loop_end(None, f"the loop's process cannot be started: {error.strerror}")
             return
@@ -380,7 +381,7 @@ class Daemon:
                     loop.kill()  # reported after its end: nothing is written any more
                     self._fault("hang", detail)
             self._read_loop()
-            self._on_loop_end(loop.exit_code, f"the loop's process {loop.describe_end()}")
+            self._on_loop_end(loop.outcome, f"the loop's process {loop.describe_end()}")
             if first_cycle is not None and self._clock.monotonic() - first_cycle > HEALTHY:
                 self._wait = self.settings.backoff[0]
         except Exception:  # of the daemon itself: the arm is not left where it is
@@ -395,10 +396,11 @@ class Daemon:
         """Return s from a request to stop until the loop is killed."""
         return STOP_TIMEOUT + longest_ramp_out(self.settings.limits) + STOP_MARGIN
 
-    def _start_loop(self, armed_by: str) -> LoopProcess:
+    def _start_loop(self, armed_by: str, since: int) -> LoopProcess:
         """Start a process of the loop, which receives only requests made from now on.
 
-        In addition, requests other than to arm that no loop has received are repeated. Raises
+        In addition, requests other than to arm that no loop has received are repeated. It arms by
+        itself for ``armed_by``, unless someone has disarmed after the request ``since``. Raises
         OSError if no process can be started.
         """
         after = self._requests.forward_all()
@@ -408,8 +410,7 @@ class Daemon:
         }  # fmt: skip
         self._requests.repeat(self.memory.last_taken)
         if armed_by and self.may_write:
-            self._requests.make(Command.ARM, armed_by)
-            self._requests.forward()
+            self._requests.arm_unless_disarmed(armed_by, since)
         self._loops += 1
         return self.loop_process(
             self.configuration, self.memory, self._commands, order, self._output, self._clock

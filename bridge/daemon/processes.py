@@ -37,6 +37,8 @@ class LoopProcess:
     process can be started.
     """
 
+    _cut_short = False  # killed on request, before it was connected
+
     def __init__(
         self, configuration: Configuration, memory: RunMemory, commands: CommandMemory,
         order: dict[str, Any], log: IO[Any] | int, clock: Clock,
@@ -86,6 +88,11 @@ class LoopProcess:
         return self._process.poll()
 
     @property
+    def outcome(self) -> int | None:
+        """Return its exit code, DONE where it was only to end and had not been connected."""
+        return Exit.DONE if self._cut_short else self.exit_code
+
+    @property
     def hangs(self) -> bool:
         """Return whether its heartbeat has stopped for longer than its phase allows."""
         memory, settings = self.memory, self._settings
@@ -110,7 +117,8 @@ class LoopProcess:
     def ask_to_stop(self) -> None:
         """Request it to ramp out and end."""
         self._commands.ask(Command.STOP)
-        if self.memory.phase in (Phase.STARTING, Phase.CONNECTING):
+        if self.memory.phase in (Phase.STARTING, Phase.CONNECTING) and self.exit_code is None:
+            self._cut_short = True
             self.kill()  # nothing is written yet, and connecting cannot be interrupted
 
     def kill(self) -> None:

@@ -51,6 +51,7 @@ class Reload:
         self._requested = threading.Event()
         self._reading: _Reading | None = None
         self._next: Configuration | None = None
+        self._compensated = False  # when a reload was requested
         self._rearm = False  # it was compensating, and the new cell arms by itself
         self._ended = False  # since it was armed last, something else ended the motion
         self.wants_end = False  # the loop is to be stopped: nothing is being written
@@ -91,7 +92,7 @@ class Reload:
         """
         following, ended = self._next, self.wants_end
         rearm = self._rearm and ended and not self._ended
-        self._next, self._rearm, self.wants_end = None, False, False
+        self._next, self.wants_end, self._rearm, self._compensated = None, False, False, False
         if following is None:
             return Swap(None, rearms=False, in_order=False)
         return Swap(following, rearms=rearm, in_order=ended)
@@ -120,7 +121,8 @@ class Reload:
             self._report(False, running if self._next is None else self._next, detail)
             return
         self._next = new
-        self._rearm = state == State.COMPENSATING and new.settings.setpoints.arm
+        self._compensated |= state == State.COMPENSATING  # a second one comes in the ramp
+        self._rearm = self._compensated and new.settings.setpoints.arm
         changed = [
             name for name in KEPT_UNTIL_RESTART
             if getattr(new.settings, name) != getattr(before, name)

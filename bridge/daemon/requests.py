@@ -42,12 +42,14 @@ class Requests:
         self._zeros_moved, self._obstacle_to = zeros_moved, obstacle_to
         self._waiting: queue.SimpleQueue[_Request] = queue.SimpleQueue()
         self._lock = threading.RLock()
+        self._disarmed = 0  # number of the last request to disarm
 
     def make(self, command: Command, by: str) -> int:
         """Queue a request; returns its number. ``by``: who or what asks."""
         known = self._zeros_moved()  # first: what is found from now on is not acknowledged
         with self._lock:
             number = self._commands.number()
+            self._disarmed = self._disarmed if command == Command.ARM else number
             self._waiting.put(_Request(number, command, by, known))
         return number
 
@@ -77,6 +79,13 @@ class Requests:
         with self._lock:  # no request is numbered and not yet written
             self.forward()
             return self._commands.number()
+
+    def arm_unless_disarmed(self, by: str, since: int) -> None:
+        """Request arming, unless someone has requested to disarm after the request ``since``."""
+        with self._lock:  # what is numbered from now on outlasts the arming
+            if self._disarmed <= since:
+                self.make(Command.ARM, by)
+        self.forward()
 
     def repeat(self, last_taken: int) -> None:
         """Repeat requests other than to arm that no loop has received, in their order."""

@@ -138,6 +138,7 @@ class LoopChecks:
         self._period = 1.0 / rate
         self._longest_gap = max(MAX_GAP_CYCLES / rate, hold_time(rate), stale_after)
         self._frozen, self._overrun = FrozenWatch(), OverrunWatch(rate)
+        self.frozen: str | None = None  # why the joints' values are not trusted
         self._saturation = SaturationWatch()
         self._moves_arm, self._hold = moves_arm, hold_time(rate)
         self.rate = RateCheck(rate)
@@ -199,7 +200,8 @@ class LoopChecks:
         self, state: RobotState, commanded: NDArray[float64], clamped: int, duration: float
     ) -> None:
         """Check a cycle after its setpoint; ``commanded`` (n,) rad, ``duration`` s."""
-        self._report(LoopCounter.FROZEN, self._frozen.update(state, commanded), Cause.FROZEN)
+        self.frozen = self._frozen.update(state, commanded)
+        self._report(LoopCounter.FROZEN, self.frozen, Cause.FROZEN)
         self._report(
             LoopCounter.SATURATED,
             self._saturation.update(state.timestamp, clamped),

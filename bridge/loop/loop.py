@@ -194,8 +194,8 @@ class Loop:
         if self._zero_moved:
             return "a joint's zero has moved: acknowledge it first (gapbridge disarm)"
         self._model_check.reset()
-        if self._checks.rate.problem:
-            return self._checks.rate.problem
+        if problem := self._checks.frozen or self._checks.rate.problem:
+            return problem
         if self._loads.problem is not None:
             return f"the load is implausible: {self._loads.problem}"
         if not stream.finite:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from clock_by_hand import ByHand
 from daemon_cell import Robot, Run, ask_again, gapbridge
 from patience import PATIENCE, wait_for
 from simulated_daemon import ask as ask_in_simulation
@@ -385,6 +386,25 @@ def test_only_a_daemon_that_may_write_observes_and_has_no_fault_is_armed(
     assert words in reply.get("error", "")
     assert daemon.asked == ([] if words else ["uid 7, pid 4"])
     assert daemon.noted[-1]["ok"] == reply["ok"]
+
+
+class Silent(Standing):
+    """One whose loop never answers."""
+
+    def events_since(self, sequence: int) -> list[dict[str, Any]]:
+        return []
+
+    def disarm(self, by: str) -> int:
+        self.asked.append(f"withdrawn: {by}")
+        return 2
+
+
+def test_an_arming_that_is_not_answered_is_withdrawn() -> None:
+    clock, daemon = ByHand(), Silent()
+    given: Any = daemon
+    reply = control.Control(given, clock).answer("arm", Peer(4, 7))
+    assert "no answer of the loop within 25 s" in reply["error"]
+    assert daemon.asked == ["uid 7, pid 4", "withdrawn: uid 7, pid 4"]
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from gapbridge.bridge.daemon.daemon import STOP_MARGIN, TICK, Daemon
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.summary import RunSummary
-from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
+from gapbridge.bridge.ipc.command_memory import Command, CommandMemory, Commands
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import STOP_TIMEOUT, Exit
@@ -73,6 +73,7 @@ class Played(LoopProcess):
         self._now, self.started = clock.monotonic, clock.monotonic()
         self.killed_at: float | None = None
         self.asked_at: float | None = None  # to stop
+        self._stops = commands.last_of(Command.STOP)  # of the loops before it
         self.own = SharedMemory(memory.n, memory.fd, clock=clock)
         self.own.enter(Phase.RUNNING)
         self.own.note_state_read()
@@ -89,7 +90,7 @@ class Played(LoopProcess):
             self.own.note_ended()
         if "dies" in self.how and self._clock.now > 0.5:
             return int(self.how["dies"])
-        if self.asked_at is None and self._commands.last_of(Command.STOP):
+        if self.asked_at is None and self._commands.last_of(Command.STOP) > self._stops:
             self.asked_at = self._clock.now
         if self.asked_at is None or "deaf" in self.how:
             return None
@@ -131,9 +132,8 @@ class Bench(Daemon):
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
         if not self.locked:
             return arm
-        return self._take_over(
-            stack.enter_context(OwnerLock("host 192.0.2.7", self.settings.cell)), arm, by
-        )
+        cell = self.settings.cell  # its address is no other test's, in another checkout either
+        return self._take_over(stack.enter_context(OwnerLock(f"host {cell}", cell)), arm, by)
 
     def run_until(self, seconds: float, arm: bool = False) -> RunSummary:
         """Run, and ask to stop after so many seconds."""
@@ -269,6 +269,92 @@ def test_what_has_not_ended_in_order_does_not_begin_again_by_itself(
     third = Owner(tmp_path)
     third.run_as_a_service(2.0)  # the second ended in order, unless it has the fault
     assert third.armed == (not latched)
+
+
+class Obeying(Played):
+    """A loop that compensates when it is to arm, and observes when it is to ramp out; at once."""
+
+    def __init__(self, how: dict[str, Any], *given: Any) -> None:
+        super().__init__(how, *given)
+        _, _, commands, order, *_ = given
+        self.state, self._received = State.OBSERVING, Commands(commands.fd, order["after"])
+
+    def events(self) -> list[dict[str, Any]]:
+        for command in self._received.take():
+            if command == Command.STOP:
+                continue
+            to = State.COMPENSATING if command == Command.ARM else State.OBSERVING
+            if to != self.state:
+                cause = Cause.ARM if to == State.COMPENSATING else Cause.DISARM
+                self._news.append(fault(to, cause) | {"from": self.state.name})
+            self.state = to
+        self.own.note_taken(self._received.last_taken)
+        self.own.note_state(self.state)
+        return super().events()
+
+
+@pytest.mark.parametrize(
+    ("of", "name", "loop"),  # a method of the daemon; of the how manieth loop
+    [("", "", 0), ("_reload", "swap", 1), ("", "_take_configuration", 1),
+     ("_requests", "repeat", 1), ("_requests", "repeat", 0)],
+)  # fmt: skip
+def test_who_disarms_before_a_loop_arms_by_itself_is_obeyed(
+    tmp_path: Path, of: str, name: str, loop: int
+) -> None:
+    daemon = Bench(tmp_path)
+    daemon.settings.cell.write_text(CELL + "setpoints: {arm: true}\n")
+    daemon._reload._in_thread = False
+    daemon.clock.acts[1.0] = daemon.reload
+
+    def make(*given: Any) -> Obeying:
+        daemon.loops.append(Obeying({}, *given))
+        return daemon.loops[-1]
+
+    daemon.loop_process = make  # type: ignore[assignment]
+    owner = getattr(daemon, of) if of else daemon
+    goes_on = getattr(owner, name) if name else None
+
+    def disarmed_first(*given: Any) -> Any:
+        if len(daemon.loops) == loop:
+            daemon.disarm("a person")
+        return goes_on(*given)
+
+    if name:
+        setattr(owner, name, disarmed_first)
+    daemon.run_until(3.0, arm=True)
+    first, second = daemon.loops
+    assert isinstance(first, Obeying)
+    assert isinstance(second, Obeying)
+    assert second.order["number"] == 1
+    assert (second.state == State.COMPENSATING) == (not name)
+
+
+class Connecting(Played):
+    """A loop that is being connected, and has read no state."""
+
+    def __init__(self, how: dict[str, Any], *given: Any) -> None:
+        super().__init__(how, *given)
+        self.own.enter(Phase.CONNECTING)
+
+
+def test_a_reload_before_the_robot_is_connected_is_no_fault(tmp_path: Path) -> None:
+    daemon = Bench(tmp_path)
+    daemon._reload._in_thread = False
+    connecting = iter([(Connecting, {"deaf": True})])
+
+    def make(*given: Any) -> Played:
+        kind, how = next(connecting, (Played, {}))
+        daemon.loops.append(kind(how, *given))
+        return daemon.loops[-1]
+
+    daemon.loop_process = make  # type: ignore[assignment]
+    daemon.clock.acts[1.0] = daemon.reload
+    summary = daemon.run_until(3.0)
+    first, second = daemon.loops
+    assert first.killed_at is not None
+    assert second.started == pytest.approx(first.killed_at + 100.0, abs=3 * TICK)  # no pause
+    assert summary.faults == ()
+    assert summary.restarts == 0
 
 
 def fails() -> None:

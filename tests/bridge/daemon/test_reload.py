@@ -108,6 +108,23 @@ def test_a_reload_arms_again_what_it_has_ramped_out(connects: bool, tmp_path: Pa
     assert (swap.rearms, swap.in_order) == (True, True)
 
 
+@pytest.mark.parametrize("later", [State.HOLDING, State.OBSERVING])
+def test_a_second_reload_before_the_first_is_done_arms_again_too(
+    later: State, tmp_path: Path
+) -> None:
+    taking = Taking(tmp_path)
+    assert taking.step(State.COMPENSATING)
+    taking.transition(Cause.DISARM)
+    taking.reload.ask()
+    taking.step(later)
+    taking.transition(Cause.RAMPED_OUT)
+    taking.step(State.OBSERVING)
+    assert taking.reload.swap().rearms
+    taking.reload.ask()
+    taking.step(State.OBSERVING)
+    assert not taking.reload.swap().rearms  # a later one has found an arm that observes
+
+
 @pytest.mark.parametrize("cause", [Cause.LINK_LOST, Cause.WRITE_FAILED, Cause.FOREIGN])
 def test_a_reload_does_not_arm_what_a_fault_has_ended(cause: Cause, tmp_path: Path) -> None:
     taking = Taking(tmp_path)

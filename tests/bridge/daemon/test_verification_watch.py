@@ -65,7 +65,7 @@ def test_a_marked_cell_is_not_armed_until_a_person_has_acknowledged_it(cell: Pat
 def test_a_cell_that_arms_by_itself_does_not_with_a_mark(cell: Path) -> None:
     write_mark(cell, REASON, cell.parent)
     with rides_on_a_program(arm=False) as (run, _):
-        run.daemon._start_loop("the cell file").kill()
+        run.daemon._start_loop("the cell file", since=0).kill()
         assert run.daemon._commands.last_of(Command.ARM) == 0
         (event,) = [e for e in run.daemon.event_log.recent if e["kind"] == "refused"]
         assert REASON in event["detail"]

@@ -40,13 +40,16 @@ class StandingArm(Driver):
         super().__init__(RATE, model, clock=ByHand())
         self.noted: list[str] = []
         self.safety_mode = 1
+        self.q, self.speed = Q, 0.0  # rad and rad/s, reported
 
     def connect(self) -> None: ...
 
     def _read_state(self) -> RobotState:
         self.clock.sleep(1.0 / RATE)
         now, still = self.clock.monotonic(), np.zeros(6)
-        return RobotState(now, now, Q, still, Q, still, safety_mode=self.safety_mode)
+        return RobotState(
+            now, now, self.q, still + self.speed, Q, still, safety_mode=self.safety_mode
+        )
 
     def _make_ready(self, state: RobotState) -> None:
         self.noted.append("armed")
@@ -253,3 +256,15 @@ def test_a_first_setpoint_far_from_the_arm_is_refused_before_the_driver_is_armed
     assert bench.driver.noted == []
     detail = bench.events[-1]["detail"]
     assert detail.startswith("joint 1: found the first setpoint 0.2000 rad from the arm")
+
+
+def test_frozen_joints_are_not_armed_until_they_move(bench: Bench) -> None:
+    def moves() -> None:
+        bench.driver.q = Q + 1e-4
+
+    bench.driver.speed = 0.1  # rad/s reported, and the joints bit-identical
+    bench.run({800: Command.ARM, 900: moves, 902: Command.ARM}, 1000)
+    refused = [e["detail"] for e in bench.events if e["kind"] == "refused"]
+    assert len(refused) == 1
+    assert "joints have been bit-identical for" in refused[0]
+    assert bench.causes()[:3] == [Cause.CONNECTED, Cause.ARM, Cause.WRITING]
