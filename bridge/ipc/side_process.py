@@ -221,6 +221,7 @@ def environment() -> dict[str, str]:
     """Return the environment with this interpreter's import path, and one thread for algebra."""
     variables = dict(os.environ)
     variables["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
+    variables["PYTHONSAFEPATH"] = "1"  # else ``-m`` imports first what lies in the working folder
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         variables[name] = "1"
     variables.pop("NOTIFY_SOCKET", None)  # only the daemon itself speaks to the service manager

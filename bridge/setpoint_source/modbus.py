@@ -42,7 +42,9 @@ class ModbusSource(InterpolatedSource):
     def open(self) -> None:
         """Start the server. Raises RunError where the address is taken."""
         memory = self._memory = PlcMemory(self.n)
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        path = os.pathsep.join(p for p in sys.path if p)
+        # safe path: else ``-m`` imports first what lies in the working folder
+        environment = {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
         server = self._server = subprocess.Popen(
             [sys.executable, "-m", SERVER],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,

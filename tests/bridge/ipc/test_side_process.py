@@ -87,6 +87,16 @@ def start(
         side.close(0.0)
 
 
+@pytest.fixture
+def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Work in a folder with somebody's ``pickle.py``; returns what it writes when it runs."""
+    folder, trace = tmp_path / "shared", tmp_path / "it_ran"
+    folder.mkdir()
+    (folder / "pickle.py").write_text(f"open({str(trace)!r}, 'w')\nraise SystemExit(7)\n")
+    monkeypatch.chdir(folder)
+    return trace
+
+
 def hear(side: SideProcess, kind: str) -> dict[str, Any]:
     found: list[dict[str, Any]] = []
 
@@ -252,3 +262,18 @@ def alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+def test_a_file_in_the_working_folder_is_not_taken_for_a_module(
+    start: Callable[[str], SideProcess], planted: Path
+) -> None:
+    side = start("import pickle\n" + textwrap.dedent(ECHO))
+    wait_for(lambda: planted.exists() or side.events(), "the file or the process")
+    assert not planted.exists()
+
+
+def test_the_loop_imports_nothing_from_the_working_folder(planted: Path) -> None:
+    command = [sys.executable, "-m", "gapbridge.bridge.loop.main"]
+    environment = side_process.environment()
+    code = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL).returncode
+    assert (code, planted.exists()) == (1, False)  # 1: it was told nothing, and ends

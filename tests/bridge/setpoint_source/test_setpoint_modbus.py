@@ -146,6 +146,17 @@ def test_a_taken_port_is_one_line(source: ModbusSource) -> None:
         make_source(settings, 3, True, Path(), clock=SYSTEM).open()
 
 
+def test_its_server_imports_nothing_from_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "json.py").write_text("raise SystemExit(7)\n")
+    monkeypatch.chdir(tmp_path)
+    settings = SetpointSettings(source="modbus", port=0)
+    source = make_source(settings, 3, True, Path(), clock=SYSTEM)
+    source.open()
+    source.close()
+
+
 def test_an_arm_of_too_many_joints_is_refused() -> None:
     with pytest.raises(InputError, match="found 11 joints, expected"):
         make_source(SetpointSettings(source="modbus"), 11, True, Path(), clock=SYSTEM)
