@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import stat
@@ -39,6 +40,19 @@ def runtime_folder() -> Path:
             path.chmod(0o700)
         return path
     raise InputError(f"{problem}, expected a folder for the daemon's socket (XDG_RUNTIME_DIR)")
+
+
+def owner_of(folder: Path) -> int:
+    """Return the user whose daemon listens in a runtime folder.
+
+    Oneself; for root also another, where not everybody can make such a folder (as in ``/tmp``).
+    Raises PermissionError for whatever else is there, OSError where there is nothing.
+    """
+    status, user = folder.lstat(), os.geteuid()
+    known = status.st_uid == user or not (user or folder.parent.stat().st_mode & stat.S_IWOTH)
+    if not stat.S_ISDIR(status.st_mode) or not known:
+        raise PermissionError(errno.EPERM, "found no folder of this user", str(folder))
+    return status.st_uid
 
 
 def state_folder() -> Path:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import socket
 import time
 from pathlib import Path
 from typing import Any
 
-from gapbridge.bridge.cell.runtime_folder import candidates, cell_key
+from gapbridge.bridge.cell.runtime_folder import candidates, cell_key, owner_of
+from gapbridge.bridge.ipc.control_socket import peer_of
 from gapbridge.core.errors import InputError, RunError, first_line
 
 ANSWER_TIMEOUT = 60.0  # s: a loop may have to restart, arming uploads a program to the robot
@@ -44,16 +46,25 @@ def ask(cell: Path, command: str) -> Any:
 
 
 def ask_socket(path: Path, command: str) -> Any:
-    """Return the answer from a daemon's socket. Raises OSError, RunError."""
+    """Return the answer from a daemon's socket.
+
+    Raises PermissionError where another user has put folder or socket there: the names are known,
+    and an answer such as "observing" must be the daemon's. Raises OSError, RunError.
+    """
+    owner = owner_of(path.parent)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
         link.settimeout(ANSWER_TIMEOUT)
         _connect(link, path)
+        if (uid := peer_of(link).uid) not in (0, owner):
+            raise PermissionError(errno.EPERM, f"found a daemon of user {uid}", str(path))
         link.sendall(json.dumps({"command": command}).encode() + b"\n")
         with link.makefile("rb") as file:
             line = file.readline()
     try:
         reply = json.loads(line)
-    except ValueError:
+        if not isinstance(reply, dict):
+            raise ValueError
+    except (ValueError, RecursionError):
         raise RunError(f"{path}: the daemon ended without an answer") from None
     if not reply.get("ok"):
         raise RunError(str(reply.get("error", "refused")))

@@ -1,0 +1,91 @@
+"""Whom a person's command speaks to: only the daemon of this user, whatever others put there."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from patience import PATIENCE
+
+from gapbridge.bridge.cell.runtime_folder import candidates, cell_key, runtime_folder
+from gapbridge.bridge.ipc import control_client
+from gapbridge.bridge.ipc.control_client import ask, ask_socket
+from gapbridge.bridge.ipc.control_socket import ControlSocket, Peer
+from gapbridge.core.errors import InputError, RunError
+from gapbridge.drivers.clock import SYSTEM
+
+STRANGER = 23456  # a user
+
+
+@pytest.fixture
+def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a cell that nobody runs, with a runtime folder for it alone."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    found = tmp_path / "cell.yaml"
+    found.write_text("robot: {model: ur10e}\n")
+    return found
+
+
+@pytest.fixture
+def asked(cell: Path) -> Iterator[list[str]]:
+    """Serve the cell's socket, saying that all is well; yields what was asked for."""
+    heard: list[str] = []
+
+    def answer(command: str, _: Peer) -> dict[str, object]:
+        heard.append(command)
+        return {"ok": True, "answer": "observing"}
+
+    with ControlSocket(runtime_folder() / f"{cell_key(cell)}.sock", answer, SYSTEM):
+        yield heard
+
+
+def test_a_socket_in_a_folder_of_somebody_else_is_not_believed(
+    cell: Path, asked: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert ask(cell, "disarm") == "observing"
+    user = os.geteuid() + 1
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    with pytest.raises(InputError, match="another user"):
+        ask(cell, "disarm")
+    assert asked == ["disarm"]
+
+
+def test_a_socket_of_somebody_else_is_not_believed(
+    cell: Path, asked: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control_client, "peer_of", lambda _: Peer(1, STRANGER))
+    with pytest.raises(InputError, match="another user"):
+        ask(cell, "disarm")
+    assert asked == []
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may ask daemons of others")
+def test_root_asks_a_service_user_but_nobody_where_everybody_makes_folders(
+    cell: Path, asked: list[str]
+) -> None:
+    folder = candidates()[0]
+    os.chown(folder, STRANGER, STRANGER)
+    assert ask(cell, "disarm") == "observing"  # as in /run/gapbridge
+    folder.parent.chmod(0o1777)  # as in /tmp
+    with pytest.raises(InputError, match="another user"):
+        ask(cell, "disarm")
+    assert asked == ["disarm"]
+
+
+@pytest.mark.parametrize("reply", [b"[]", b"3", b"", b"observing", b"[" * 100_000])
+def test_an_answer_that_is_none_is_one_line(cell: Path, reply: bytes) -> None:
+    path = runtime_folder() / "x.sock"
+    with socket.socket(socket.AF_UNIX) as listener, ThreadPoolExecutor(1) as pool:
+        listener.bind(str(path))
+        listener.listen()
+        asked = pool.submit(ask_socket, path, "disarm")
+        with listener.accept()[0] as connection:
+            connection.recv(100)
+            connection.sendall(reply + b"\n")
+        with pytest.raises(RunError, match="without an answer"):
+            asked.result(PATIENCE)
