@@ -12,7 +12,7 @@ from pathlib import Path
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.message import located
-from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
+from gapbridge.bridge.cell.runtime_folder import PLANNER, cell_key, runtime_folder
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.served.credentials import SETPOINT_TOKEN, check_credentials, read_token
 from gapbridge.core.errors import CellError, InputError
@@ -109,7 +109,7 @@ def _setpoint_settings(cell: Cell) -> SetpointSettings:
         if (path := getattr(section, name)) is not None
     }
     if section.source == "planner" and section.socket is None:
-        update["socket"] = runtime_folder() / f"{cell_key(cell.path)}.planner.sock"
+        update["socket"] = runtime_folder() / f"{cell_key(cell.path)}{PLANNER}"
     elif section.source == "planner":
         _require_socket_path(update["socket"])
     if section.source == "tcp" and section.token_file is not None:

@@ -11,6 +11,8 @@ from pathlib import Path
 
 from gapbridge.core.errors import InputError
 
+PLANNER = ".planner.sock"  # ends the name of a planner's socket; a daemon's ends with .sock
+
 
 def candidates() -> list[Path]:
     """Return the possible runtime folders of a daemon of this user, preferred first."""

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gapbridge.bridge.cell.runtime_folder import candidates, cell_key, owner_of
+from gapbridge.bridge.cell.runtime_folder import PLANNER, candidates, cell_key, owner_of
 from gapbridge.bridge.ipc.control_socket import peer_of
 from gapbridge.core.errors import InputError, RunError, first_line
 
@@ -86,6 +86,8 @@ def running() -> list[Any]:
     for folder in dict.fromkeys(candidates()):
         with contextlib.suppress(OSError):
             for path in sorted(folder.glob("*.sock")):
+                if path.name.endswith(PLANNER):  # knows no status, and is read by cycles only
+                    continue
                 with contextlib.suppress(OSError, RunError):
                     statuses.append(ask_socket(path, "status"))
     return statuses

@@ -13,7 +13,7 @@ from patience import PATIENCE
 
 from gapbridge.bridge.cell.runtime_folder import candidates, cell_key, runtime_folder
 from gapbridge.bridge.ipc import control_client
-from gapbridge.bridge.ipc.control_client import ask, ask_socket
+from gapbridge.bridge.ipc.control_client import ask, ask_socket, running
 from gapbridge.bridge.ipc.control_socket import ControlSocket, Peer
 from gapbridge.core.errors import InputError, RunError
 from gapbridge.drivers.clock import SYSTEM
@@ -89,3 +89,18 @@ def test_an_answer_that_is_none_is_one_line(cell: Path, reply: bytes) -> None:
             connection.sendall(reply + b"\n")
         with pytest.raises(RunError, match="without an answer"):
             asked.result(PATIENCE)
+
+
+def test_the_status_of_all_daemons_is_not_asked_of_a_planners_socket(
+    cell: Path, asked: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = runtime_folder()
+    monkeypatch.setattr(control_client, "candidates", lambda: [folder])  # not of other tests
+    path = folder / f"{cell_key(cell)}.planner.sock"
+    with socket.socket(socket.AF_UNIX) as planner:
+        planner.bind(str(path))
+        planner.listen()
+        planner.setblocking(False)
+        assert running() == ["observing"]
+        with pytest.raises(BlockingIOError):
+            planner.accept()  # while the loop connects or arms, nobody would answer
