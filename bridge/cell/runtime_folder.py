@@ -80,5 +80,6 @@ def state_folder() -> Path:
 
 def cell_key(cell: Path) -> str:
     """Return a short name for a cell file: its stem and a hash of its absolute path."""
-    absolute = str(cell.resolve())
-    return f"{cell.stem[:40]}-{hashlib.sha256(absolute.encode()).hexdigest()[:10]}"
+    absolute = os.fsencode(cell.resolve())
+    stem = os.fsencode(cell.stem)[:40].decode(errors="ignore")  # bytes: a socket's path holds 107
+    return f"{stem}-{hashlib.sha256(absolute).hexdigest()[:10]}"

@@ -13,7 +13,7 @@ from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import Cause
-from gapbridge.core.errors import InputError
+from gapbridge.core.errors import InputError, first_line
 from gapbridge.drivers.clock import Clock
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
@@ -89,7 +89,7 @@ class Control:
         try:
             listener.open()
         except OSError as error:
-            detail = f"{listener.path}: {error.strerror}, expected a socket to listen on"
+            detail = f"{listener.path}: {first_line(error)}, expected a socket to listen on"
             raise InputError(detail) from None
         try:
             yield

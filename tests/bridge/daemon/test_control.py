@@ -449,6 +449,30 @@ def test_the_same_cell_has_the_same_name_from_everywhere(
     assert cell_key(tmp_path / "cell.yaml") != cell_key(tmp_path / "a" / "cell.yaml")
 
 
+@pytest.mark.parametrize(
+    ("name", "stem"),
+    [("cell_3", "cell_3"), (50 * "x", 40 * "x"), (40 * "я", 20 * "я"), (40 * "焊", 13 * "焊"),
+     ("a\udcff", "a")],
+)  # fmt: skip
+def test_the_path_of_a_socket_is_short_enough_whatever_the_cells_name(
+    tmp_path: Path, name: str, stem: str
+) -> None:
+    key = cell_key(tmp_path / f"{name}.yaml")
+    assert len(f"/run/user/1000/gapbridge/{key}.planner.sock".encode()) <= 107  # unix(7)
+    assert key[:-11] == stem
+
+
+def test_a_folder_too_deep_for_a_socket_is_named_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deep = tmp_path / (120 * "x")
+    deep.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(deep))
+    served = control.Control(NoLoop(), clock=SYSTEM)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="path too long, expected a socket to listen on"):
+        served.socket(tmp_path / "cell.yaml").__enter__()
+
+
 @pytest.mark.slow
 def test_a_disarming_between_two_loops_is_kept_and_answered_by_the_next(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
