@@ -30,6 +30,7 @@ from gapbridge.bridge.ipc.command_memory import Commands
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.sealed_memory import all_bytes
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
+from gapbridge.bridge.loop.claimed_controller import claimed_controller
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.replay import ReplayedLoop
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
@@ -42,6 +43,7 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.drivers import make_driver
 from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.controller_address import address_of
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
 from gapbridge.drivers.replay.driver import ReplayDriver
@@ -53,7 +55,7 @@ LOCK_ALL = 3  # MCL_CURRENT | MCL_FUTURE
 LATENCY = "/dev/cpu_dma_latency"  # the kernel's PM QoS interface
 IDLE_DRIVER = "/sys/devices/system/cpu/cpuidle/current_driver"  # the kernel's idle driver
 FAST = 0.005  # s: loops with this cycle or a shorter one keep the processors awake
-_open_files: list[int] = []  # kept open: closing one would undo its effect
+_open_files: list[int] = []  # kept open to the end: closing one would undo its effect
 _PR_SET_PDEATHSIG = 1
 LONGEST_DETAIL = 1000  # of an event
 
@@ -88,13 +90,17 @@ def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None], clock: C
     files = pickle.loads(all_bytes(order["files"]))  # by the daemon, which started this process
     read_only_given(files)  # only the daemon reads the disk, at start and reload
     settings = DaemonSettings.model_validate(order["settings"])
+    _end_with_parent(order["parent"])
+    if sys.platform.startswith("linux"):  # before anything looks at what is in force in the arm
+        claimed = claimed_controller(address_of(settings.link), emit, clock)
+        _open_files.append(claimed.detach())
+        memory.enter(Phase.STARTING)  # what it has waited does not count as silence
     model = _read_model(settings)
     driver = make_driver(settings.link, model, gate_bounds(settings.limits), clock)
     source = _make_source(settings, model, driver)
     loop = _make_loop(settings, model, driver, source, memory, emit, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: loop.request_stop())
-    _end_with_parent(order["parent"])
     _compile(settings, model, clock)
     if order["may_write"]:
         source.open()
@@ -172,7 +178,10 @@ def _compile(settings: DaemonSettings, model: Model, clock: Clock) -> None:
 
 
 def _end_with_parent(parent: int) -> None:
-    """Have the kernel send SIGTERM when the daemon dies, so that the loop ramps out and ends."""
+    """Have the kernel send SIGTERM when the daemon dies, so that the loop ramps out and ends.
+
+    Before there is a loop, SIGTERM ends the process at once.
+    """
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != parent:
