@@ -114,7 +114,7 @@ class Reload:
 
     def _take(self, state: State, running: Configuration, reading: _Reading) -> None:
         """Take what was read, or report why not."""
-        before, new = running.settings, reading.found
+        new = reading.found
         if new is None:
             self._manager.ready()
             detail = f"the cell file was not taken, the old one stays: {reading.problem}"
@@ -123,11 +123,7 @@ class Reload:
         self._next = new
         self._compensated |= state == State.COMPENSATING  # a second one comes in the ramp
         self._rearm = self._compensated and new.settings.setpoints.arm
-        changed = [
-            name for name in KEPT_UNTIL_RESTART
-            if getattr(new.settings, name) != getattr(before, name)
-        ]  # fmt: skip
-        later = f"; {', '.join(changed)}: at the daemon's next start" if changed else ""
+        later = f"; {', '.join(reading.later)}: at the daemon's next start" if reading.later else ""
         detail = f"the cell file was read again and is being taken{later}"
         self._report(True, self._next, detail)
 
@@ -144,13 +140,20 @@ class _Reading(threading.Thread):
         super().__init__(name="reload", daemon=True)
         self._running = running
         self.found: Configuration | None = None  # with what must not change in a run
+        self.later: list[str] = []  # sections that have changed and are not taken in this run
         self.problem = "it could not be read"  # without which nothing was found
 
     def run(self) -> None:
         """See threading.Thread."""
-        cell = self._running.settings.cell
+        before = self._running.settings
+        cell = before.cell
         try:
-            self.found = _compatible(read_configuration(cell), self._running)
+            new = read_configuration(cell)
+            self.later = [
+                name for name in KEPT_UNTIL_RESTART
+                if getattr(new.settings, name) != getattr(before, name)
+            ]  # fmt: skip
+            self.found = _compatible(new, self._running)
         except GapbridgeError as error:
             self.problem = "; ".join(_messages(cell, error))
 
@@ -168,7 +171,8 @@ def _compatible(new: Configuration, running: Configuration) -> Configuration:
             f"{settings.cell}: link: found {address_of(settings.link)}, expected "
             f"{address_of(before.link)} as before: stop and restart the daemon"
         )
-    fixed = {name: getattr(before, name) for name in ("model_source", "hang_timeout", "backoff")}
+    kept = ("model_source", "hang_timeout", "backoff", *KEPT_UNTIL_RESTART)
+    fixed = {name: getattr(before, name) for name in kept}
     return replace(new, settings=settings.model_copy(update=fixed))
 
 

@@ -161,6 +161,27 @@ def test_a_person_who_disarms_while_a_reload_ramps_out_is_obeyed(
     assert not taking.reload.swap().rearms
 
 
+def test_sections_of_running_processes_stay_and_each_reload_names_them(tmp_path: Path) -> None:
+    taking = Taking(tmp_path)
+    cell, running = taking.running.settings.cell, taking.running
+    for folder, port in ("elsewhere", 9101), ("third", 9102):
+        cell.write_text(
+            f"{CELL}recording: {{folder: {folder}}}\nmetrics: {{port: {port}}}\n"
+            "limits: {offset: 0.003}\n"
+        )
+        taking.reload.ask()
+        taking.step(State.OBSERVING)
+        (*_, event) = taking.reload._event_log.recent
+        assert event["ok"]
+        assert event["detail"].endswith("recording, metrics: at the daemon's next start")
+        new = taking.reload.swap().configuration
+        assert new is not None
+        assert new.settings.recording == running.settings.recording
+        assert new.settings.metrics is None
+        assert new.settings.limits.offset == 0.003
+        taking.running = new
+
+
 PATIENT = ", state_timeout: 0.25"
 
 
