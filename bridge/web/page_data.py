@@ -251,8 +251,14 @@ class History:
         self._pending = np.empty((0, len(COLUMNS)))  # cycles of an incomplete point
 
     def add(self, cycles: Array, now: float) -> Array:
-        """Add cycles (k, columns) in time order; returns the points that are complete now."""
+        """Add cycles (k, columns) in time order; returns the points that are complete now.
+
+        What is later than ``now`` is from before the clock was set back, and is dropped.
+        """
         pending = np.concatenate([self._pending, cycles])
+        pending = pending[pending[:, 0] <= now]
+        if len(self._points) and self._points[-1, 0] > now:
+            self._points = self._points[self._points[:, 0] <= now]
         if not len(pending):
             return pending
         slot = np.floor(pending[:, 0] / STEP)

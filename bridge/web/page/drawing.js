@@ -24,6 +24,14 @@ export function colour(name) {
 }
 export function forgetColours() { styles = null; }
 
+// Points, the newest one last, of the last seconds; not those from before a clock was set back.
+export function recent(points, seconds) {
+  if (!points.length) return points;
+  const newest = points[points.length - 1][0];
+  const outside = (p) => p[0] < newest - seconds || p[0] > newest + 1;
+  return points.some(outside) ? points.filter((p) => !outside(p) && p[0] <= newest) : points;
+}
+
 function steps(low, high, about) {
   const raw = (high - low) / about;
   const power = 10 ** Math.floor(Math.log10(raw));

@@ -1,6 +1,6 @@
 // The page: takes the daemon's messages, fills in texts and figures, draws.
 import { MEANING, clock, count, duration, describe, fixed, number } from './messages.js';
-import { Lines, colour, drawHistogram, forgetColours } from './drawing.js';
+import { Lines, colour, drawHistogram, forgetColours, recent } from './drawing.js';
 import { View } from './view.js';
 
 const $ = (id) => document.getElementById(id);
@@ -58,10 +58,7 @@ function take(points) {
     point.state = seen.about.states[point[1]] || 'unknown';
     seen.points.push(point);
   }
-  const oldest = seen.points.length ? seen.points[seen.points.length - 1][0] - KEPT : 0;
-  let drop = 0;
-  while (drop < seen.points.length && seen.points[drop][0] < oldest) drop++;
-  if (drop) seen.points.splice(0, drop);
+  seen.points = recent(seen.points, KEPT);
 }
 
 async function fetchHistory() {

@@ -272,3 +272,22 @@ def test_text_from_the_robot_is_shown_and_never_run(browser, feed):
         )
         assert page.locator("#events img").count() == 0
         assert complaints == []
+
+
+SET_BACK = """async () => {
+  const { recent } = await import('/drawing.js');
+  let points = [], wall = 1e6, most = 0;
+  for (let i = 0; i < 2000; i++) {
+    if (i === 1000) wall -= 7200;
+    points = recent([...points, [wall + i]], 600);
+    most = Math.max(most, points.length);
+  }
+  return [most, points[0][0] - wall, points.length];
+}"""
+
+
+def test_a_clock_that_is_set_back_leaves_no_points_in_the_future(browser, feed):
+    with opened(browser, feed) as (page, _, complaints):
+        live(page)
+        assert page.evaluate(SET_BACK) == [601, 1399, 601]
+        assert complaints == []
