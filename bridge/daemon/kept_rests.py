@@ -7,7 +7,7 @@ and rests while the cell and its files are the same, and a slip until it is ackn
 from __future__ import annotations
 
 import json
-from concurrent.futures import Future, ThreadPoolExecutor
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -26,23 +26,26 @@ from gapbridge.drivers.clock import Clock
 SCHEMA = "gapbridge.rests/1"
 EVERY = 60.0  # s between two writes
 LONGEST = 4_000_000  # bytes
+LONGEST_WAIT = 2.0  # s for the last write: a network mount may hang, and the daemon ends anyway
 LARGEST = 1e6  # of any number
 SLIP = ("joints", "size", "std", "since", "detail")  # fields of the event
 
 
 class KeptRests:
-    """Reads the file at the start of a run and writes it, in a thread: disks can be slow."""
+    """Reads the file at the start of a run and writes it, in a thread: disks can be slow.
 
-    def __init__(self, clock: Clock) -> None:
-        self._now = clock.monotonic
+    ``longest_wait``: s of real time for the end of a write.
+    """
+
+    def __init__(self, clock: Clock, longest_wait: float = LONGEST_WAIT) -> None:
+        self._now, self._longest_wait = clock.monotonic, longest_wait
         self._path: Path | None = None  # None: nothing is kept
         self._text = ""  # written last
         self._due = 0.0  # s, monotonic
         self._slip: Event | None = None  # not acknowledged
         self._is_new = False  # that slip is of an earlier run, and not reported in this one
         self._failed = False  # reported
-        self._writer = ThreadPoolExecutor(1)  # starts no thread before the first write
-        self._writing: Future[None] | None = None
+        self._writing: _Write | None = None
 
     def open(self, path: Path, watch: SlipWatch, configuration: Configuration) -> str:
         """Have ``watch`` continue with what the file holds; returns why not, if it does not."""
@@ -87,31 +90,34 @@ class KeptRests:
         """Write what is new, once a minute or ``at_once``; returns why it failed, once."""
         if self._path is None or (self._now() < self._due and not at_once):
             return ""
+        if self._writing is not None and self._writing.is_alive():
+            self._due = self._now()  # what is new is written after it
+            return ""
+        problem = self._problem()
         self._due = self._now() + EVERY
         text = self._document(watch, configuration)
         if text != self._text:
-            self._text = text
+            self._text, self._writing = text, _Write(self._path, text)
             try:
-                self._writing = self._writer.submit(write_text, self._path, text)
+                self._writing.start()
             except RuntimeError:  # no thread can be started
-                self._text = ""  # tried again
+                self._text, self._writing = "", None  # tried again
+        return problem
+
+    def finish(self) -> str:
+        """Wait for a write that is under way; returns why what it writes is lost, once."""
+        if self._writing is None:
+            return ""
+        self._writing.join(self._longest_wait)
         return self._problem()
 
-    def close(self) -> None:
-        """Wait until the last write is done."""
-        self._writer.shutdown()
-
     def _problem(self) -> str:
-        if self._writing is None or not self._writing.done():
-            return ""
-        error, self._writing = self._writing.exception(), None
-        if error is None:
+        if self._writing is None or not (what := self._writing.problem):
             return ""
         self._text = ""  # tried again
         if self._failed:
             return ""
         self._failed = True
-        what = str(error) if isinstance(error, GapbridgeError) else type(error).__name__
         return f"what was learned of the joints' zeros is lost at the end: {what}"
 
     def _document(self, watch: SlipWatch, configuration: Configuration) -> str:
@@ -132,6 +138,24 @@ class KeptRests:
             ],
         }  # fmt: skip
         return json.dumps(document, separators=(",", ":")) + "\n"
+
+
+class _Write(threading.Thread):
+    """A write that nobody has to wait for, not even the end of the process."""
+
+    def __init__(self, path: Path, text: str) -> None:
+        super().__init__(name="rests", daemon=True)
+        self._path, self._text = path, text
+        self.problem = f"{path}: the file system does not answer"  # until it has
+
+    def run(self) -> None:
+        """See threading.Thread."""
+        try:
+            write_text(self._path, self._text)
+            self.problem = ""
+        except Exception as error:  # whatever it is, the daemon goes on
+            is_own = isinstance(error, GapbridgeError)
+            self.problem = str(error) if is_own else type(error).__name__
 
 
 def _number(value: float) -> float | None:

@@ -58,13 +58,17 @@ class ZeroWatch:
             self._emit({"kind": EventKind.NOTE, "detail": detail})
 
     def close(self) -> None:
-        """Keep what was learned, and wait until it is written."""
+        """Keep what was learned, and wait until it is written, unless the disk does not answer."""
+        self._warn(self.kept.finish())
         self.keep(at_once=True)
-        self.kept.close()
+        self._warn(self.kept.finish())
 
     def keep(self, at_once: bool = False) -> None:
         """Write what was learned, once a minute or ``at_once``."""
-        if detail := self.kept.step(self.slips, self._configuration, at_once):
+        self._warn(self.kept.step(self.slips, self._configuration, at_once))
+
+    def _warn(self, detail: str) -> None:
+        if detail:
             self._emit({"kind": EventKind.WARNING, "what": "rests_not_kept", "detail": detail})
 
     def configure(self, new: Configuration) -> None:

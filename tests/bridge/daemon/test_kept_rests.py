@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from gapbridge.bridge.daemon.kept_rests import EVERY, KeptRests
 from gapbridge.bridge.daemon.slip_watch import SlipWatch, slip_event
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.diagnosis.rests.rest_comparison import Slip
-from gapbridge.core.errors import InputError, RunError
+from gapbridge.core.errors import InputError
 from gapbridge.drivers.clock import SYSTEM
 
 LEARNING, ROUNDS = 6 * COUNTS, 2 * COUNTS + 1  # rests
@@ -44,6 +45,11 @@ def watch_of(program: Program) -> SlipWatch:
     return SlipWatch(program.model, SLICES, 0.003)
 
 
+def until_written(kept: KeptRests) -> None:
+    if kept._writing is not None:
+        kept._writing.join()
+
+
 def a_run(path: Path, cell: Configuration, watch: SlipWatch, *events: dict[str, Any]) -> str:
     """Have a run of the daemon begin with the file and end with what ``watch`` holds then."""
     kept = KeptRests(SYSTEM)
@@ -51,7 +57,7 @@ def a_run(path: Path, cell: Configuration, watch: SlipWatch, *events: dict[str, 
     for event in events:
         kept.on_event(event)
     assert kept.step(watch, cell, at_once=True) == ""
-    kept.close()
+    until_written(kept)
     return detail
 
 
@@ -63,7 +69,7 @@ def learned(path: Path, cell: Configuration) -> Program:
     assert kept.open(path, watch, cell) == ""
     assert found_in(watch, program, LEARNING)[:2] == ([], [])
     kept.step(watch, cell, at_once=True)
-    kept.close()
+    until_written(kept)
     return program
 
 
@@ -195,7 +201,7 @@ def test_a_slip_is_kept_until_it_is_acknowledged_whatever_the_cell(
 
 
 def test_the_file_is_written_once_a_minute_and_only_if_something_is_new(
-    path: Path, cell: Configuration
+    path: Path, cell: Configuration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     world = World(1)
     clock = SimulatedClock(world)
@@ -203,7 +209,7 @@ def test_the_file_is_written_once_a_minute_and_only_if_something_is_new(
     watch, kept = watch_of(program), KeptRests(clock)
     kept.open(path, watch, cell)
     written: list[float] = []
-    kept._writer.submit = lambda *_: written.append(world.now)  # type: ignore[assignment,method-assign]
+    monkeypatch.setattr(kept_rests._Write, "start", lambda _: written.append(world.now))
     kept._problem = lambda: ""  # type: ignore[method-assign]
     for number in range(LEARNING + 3):
         found_in(watch, program, 1)
@@ -222,19 +228,44 @@ def test_the_file_is_written_once_a_minute_and_only_if_something_is_new(
 def test_a_disk_that_cannot_be_written_is_told_once(
     learned: Program, tmp_path: Path, cell: Configuration
 ) -> None:
-    watch, kept = watch_of(learned), KeptRests(SYSTEM)
+    watch, kept = watch_of(learned), KeptRests(SYSTEM, longest_wait=30.0)
     kept.open(tmp_path / "none" / "x.json", watch, cell)
     kept.on_event(FOUND)
     detail = []
     for _ in range(3):
         detail.append(kept.step(watch, cell, at_once=True))
-        if kept._writing is not None:
-            assert isinstance(kept._writing.exception(30.0), RunError)
-    kept.close()
+        detail.append(kept.finish())
     detail.append(kept.step(watch, cell))
     (line,) = [line for line in detail if line]
     assert "is lost at the end" in line
     assert "cannot be written" in line
+
+
+def test_a_disk_that_does_not_answer_keeps_no_daemon_from_its_end(
+    path: Path, cell: Configuration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers, texts, slow = threading.Event(), iter("abcd"), list[str]()
+
+    def hangs(_: Path, text: str) -> None:
+        slow.append(text)
+        answers.wait(30.0)
+
+    kept = KeptRests(SYSTEM, longest_wait=0.01)
+    kept._path = path
+    with monkeypatch.context() as patched:
+        patched.setattr(kept_rests, "write_text", hangs)
+        patched.setattr(kept, "_document", lambda *_: next(texts))
+        for _ in range(3):  # nothing waits behind a write that hangs
+            assert kept.step(None, None, at_once=True) == ""  # type: ignore[arg-type]
+        assert f"{path}: the file system does not answer" in kept.finish()
+        assert kept.finish() == ""  # told once
+        assert kept._writing is not None
+        assert kept._writing.daemon  # the interpreter does not wait for it either
+        answers.set()
+        kept._writing.join()
+        kept.step(None, None)  # type: ignore[arg-type]
+        kept._writing.join()
+    assert slow == ["a", "b"]
 
 
 def test_a_loop_that_dies_leaves_the_watch_as_it_is_and_a_changed_cell_does_not() -> None:
@@ -259,7 +290,7 @@ def test_a_slip_that_nobody_has_acknowledged_holds_the_next_run_of_the_daemon(
         daemon._zeros.open()
         daemon._zeros.slips.take = lambda rows: [FOUND] if world.now < begun + 0.02 else []  # type: ignore[method-assign]
         until(world, lambda: daemon.state == State.OBSERVING, 3.0)
-        daemon._zeros.kept.close()
+        until_written(daemon._zeros.kept)
     assert [p.parent.name for p in tmp_path.rglob("*.rests.json")] == ["gapbridge"]
     for acknowledge in (True, False):
         with rides_on_a_program(arm=False) as (run, world):
@@ -272,7 +303,7 @@ def test_a_slip_that_nobody_has_acknowledged_holds_the_next_run_of_the_daemon(
                 assert FOUND["detail"] in ask(run, "arm")["error"]
                 assert ask(run, "disarm")["ok"]
             assert ask(run, "arm")["answer"] == "compensating"
-            daemon._zeros.kept.close()
+            until_written(daemon._zeros.kept)
 
 
 def test_the_state_folder_is_the_service_managers_or_the_users_own(

@@ -170,5 +170,6 @@ def test_without_a_thread_what_was_learned_of_the_zeros_is_kept_later(
         patched.setattr(threading.Thread, "start", starts_no_thread)
         assert kept.step(None, None, at_once=True) == ""  # type: ignore[arg-type]
     kept.step(None, None, at_once=True)  # type: ignore[arg-type]
-    kept.close()
+    assert kept._writing is not None
+    kept._writing.join()
     assert (tmp_path / "rests.json").read_text() == "b"
