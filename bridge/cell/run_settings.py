@@ -45,6 +45,11 @@ class Configuration:
         digests = [hashlib.sha256(self.files[name]).digest() for name in sorted(self.files)]
         return hashlib.sha256(self.text.encode() + b"".join(digests)).hexdigest()
 
+    @property
+    def digests(self) -> dict[str, str]:
+        """Return the SHA-256 of every file, by absolute path."""
+        return {name: hashlib.sha256(data).hexdigest() for name, data in self.files.items()}
+
 
 def configuration_for(settings: DaemonSettings) -> Configuration:
     """Return the configuration of given settings; reads their cell file. Raises InputError."""

@@ -74,9 +74,8 @@ class Daemon:
         if not isinstance(configuration, Configuration):
             configuration = configuration_for(configuration)
         self.configuration = configuration  # read once; loops get the same bytes
-        settings = configuration.settings
+        settings, n = configuration.settings, configuration.n
         self.may_write, self._say = may_write, say
-        n = self.configuration.n
         self.memory = RunMemory(n, clock)  # of the present process of the loop
         self._commands = CommandMemory()  # one for the whole run; only the daemon can write
         self._last_taken = 0
@@ -208,6 +207,7 @@ class Daemon:
     def _take_configuration(self, new: Configuration) -> None:
         """Take what the next loop runs with."""
         self.configuration = new
+        self.side_processes.configure(new)
         self._fitted = FittedWatch(new.fitted, self.memory.slices)
         self._zeros.configure(new)
 

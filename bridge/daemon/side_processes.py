@@ -29,6 +29,7 @@ class SideProcesses:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._running: dict[str, SideProcess] = {}
+        self._start_data: dict[str, Any] = {}  # of all, also of those that are started again
 
     def start(
         self,
@@ -39,13 +40,19 @@ class SideProcesses:
     ) -> None:
         """Start those that the settings enable."""
         settings = configuration.settings
-        start_data = {
-            "settings": settings.model_dump(mode="json"), "n": configuration.n, "session": session,
-            "extra": {"text": configuration.text},
-        }  # fmt: skip
+        data = self._start_data
+        data.update(_start_data(configuration), n=configuration.n, session=session)
         for name, (module, is_enabled) in SIDE_PROCESSES.items():
             if is_enabled(settings):
-                self._running[name] = SideProcess(module, start_data, memory, self._clock, log)
+                self._running[name] = SideProcess(module, data, memory, self._clock, log)
+
+    def configure(self, new: Configuration) -> None:
+        """Pass on what the next loop runs with, unless it is the same; for later starts, too."""
+        data = _start_data(new)
+        if data.items() <= self._start_data.items():
+            return
+        self._start_data.update(data)
+        self.emit({"kind": EventKind.CELL, **data["extra"]})
 
     def show(self, memory: SharedMemory) -> None:
         """Switch all of them to another memory."""
@@ -92,6 +99,14 @@ class SideProcesses:
         self._running.clear()
         for event in events:
             emit(event)
+
+
+def _start_data(configuration: Configuration) -> dict[str, Any]:
+    """Return the part of the start data that a reload changes."""
+    return {
+        "settings": configuration.settings.model_dump(mode="json"),
+        "extra": {"text": configuration.text, "digests": configuration.digests},
+    }
 
 
 def _checked(name: str, event: dict[str, Any]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ class EventKind(StrEnum):
     NOTE = "note"  # information
     TRANSITION = "transition"  # the supervisor changed state
     STATUS = "status"  # the status document, to side processes only
+    CELL = "cell"  # the cell that the next loop runs with, to side processes only: it has secrets
     REQUEST = "request"  # somebody asked to arm or to disarm
     CONTROL = "control"  # the answer to a request over the local socket
     REFUSED = "refused"  # arming was refused

@@ -132,6 +132,7 @@ class Counts:
         self._updated.on_event(event)
         if kind == EventKind.STATUS:
             self.status = event
+        if kind in (EventKind.STATUS, EventKind.CELL):
             return
         self.events[kind] += 1
         if kind == EventKind.RECORDER:

@@ -36,7 +36,7 @@ def main() -> None:
         start.settings.recording,
         start.session,
         start.memory,
-        _configuration(start),
+        configuration_of(start, start.extra.get("text")),
         start.emit,
         start.clock,
     )
@@ -53,10 +53,11 @@ def _follow(start: StartData, recorder: Recorder) -> bool:
         start.events.wait(LOOK_EVERY)
         start.clock.sleep(LOOK_EVERY / 2)  # events come in bursts; cycles wait in the ring
         for event in start.events.poll():
+            if event.get("kind") == EventKind.CELL:
+                recorder.change_configuration(configuration_of(start, event["text"]))
+                continue
             recorder.take(event)
             ended |= event.get("kind") == EventKind.ENDED
-            if event.get("kind") == EventKind.CONFIGURATION:
-                recorder.change_configuration(_configuration(start, event))
         recorder.step()
     return ended
 
@@ -71,10 +72,13 @@ def _record_remaining(start: StartData, recorder: Recorder) -> None:
         start.clock.sleep(LOOK_EVERY)
 
 
-def _configuration(start: StartData, event: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Return program, cell file and driver of the run, without secrets."""
+def configuration_of(start: StartData, text: str | None) -> dict[str, Any]:
+    """Return program, cell file and driver of the run, without secrets.
+
+    ``text``: of the cell file, as the daemon has read it; None: as the disk has it.
+    """
     cell = start.settings.cell
-    content = _text_of(cell, (event or start.extra).get("text"))
+    content = _text_of(cell, text)
     return {
         "program": f"gapbridge {_version()}",
         "cell": str(cell),
@@ -85,9 +89,9 @@ def _configuration(start: StartData, event: dict[str, Any] | None = None) -> dic
     }
 
 
-def _text_of(cell: Path, text: object) -> bytes:
-    """Return the cell file's bytes: ``text`` as the daemon has read it, else the file's."""
-    if isinstance(text, str):
+def _text_of(cell: Path, text: str | None) -> bytes:
+    """Return the cell file's bytes: those of ``text``, else the file's."""
+    if text is not None:
         return text.encode()
     try:
         return cell.read_bytes()

@@ -103,9 +103,7 @@ def run(start: StartData) -> None:
     assert settings is not None
     path = settings.token_file
     token = None if path is None else read_token(path, ("web", "token_file"))
-    page = PageData(
-        start.settings, start.n, start.session, start.memory, start.clock, start.extra.get("text")
-    )
+    page = PageData(start.settings, start.n, start.session, start.memory, start.clock, start.extra)
     stream = Stream(settings.clients)
 
     def update() -> None:

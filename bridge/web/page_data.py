@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -44,7 +46,11 @@ OFFSET, MEASURED, PREDICTED = slice(2, 8), slice(8, 14), slice(14, 20)
 
 
 class PageData:
-    """Collects the data; ``update`` returns messages on what is new since the last call."""
+    """Collects the data; ``update`` returns messages on what is new since the last call.
+
+    ``extra``: the cell file's ``text`` and the ``digests`` of all its files, as the daemon has read
+    them.
+    """
 
     def __init__(
         self,
@@ -53,16 +59,17 @@ class PageData:
         session: str,
         memory: SharedMemory,
         clock: Clock,
-        text: str | None = None,
+        extra: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         assert settings.web is not None
-        self._updated = UpdatedSettings(settings, text)  # text: the cell file's
+        self._updated = UpdatedSettings(settings, extra.get("text"))
+        self._digests: dict[str, str] | None = extra.get("digests")
         self._clock = clock
         self._session, self._memory = session, memory
         self._slices, self._n = memory.slices, n
         # a page opened late shows what the ring holds
         self._reader = memory.reader(max(memory.written - ROWS + ROWS // 4, 0))
-        self._prediction = Prediction(settings, memory.slices)
+        self._prediction = Prediction(settings, memory.slices, self._digests)
         self._history = History(settings.web.history)
         self._timing = Timing()
         self._timing_at = self._arm_at = 0.0
@@ -87,8 +94,9 @@ class PageData:
         """Process new events and cycles; returns messages for the open pages."""
         messages = [message for event in events for message in self._on_event(event)]
         changed = [self._updated.on_event(event) for event in events]
+        if any(changed) or any(event.get("kind") == EventKind.CELL for event in events):
+            self._prediction = Prediction(self._settings, self._slices, self._digests)
         if any(changed):
-            self._prediction = Prediction(self._settings, self._slices)
             messages.append(("hello", self.snapshot()))  # limits and rate may have changed
         points = self._take(self._reader.drain())
         messages.append(("tick", {**self.now(), "points": plain(points)}))
@@ -107,6 +115,9 @@ class PageData:
             self.status = event
             self._no_loop = "state" in event and not has_link(event["state"])
             return [("status", event)]
+        if event.get("kind") == EventKind.CELL:  # not for pages: it has the cell's secrets
+            self._digests = event["digests"]
+            return []
         if "to" in event:
             self._why = event
             self._down, self._no_loop = event["to"] == State.DISCONNECTED.name, False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Mapping
 from pkgutil import resolve_name
@@ -16,6 +17,7 @@ from gapbridge.bridge.document.skeleton import reach, round_factor, skeleton
 from gapbridge.core.arrays import Array
 from gapbridge.core.dynamics import predict_wrench
 from gapbridge.core.errors import GapbridgeError
+from gapbridge.core.files import recorded
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
@@ -26,19 +28,29 @@ DRAWN = 0.15  # of the reach: drawn deflection of the stretched arm
 class Prediction:
     """Predicts for rows of the shared memory, in this process, not in the loop's.
 
-    The model is read in a thread; until it is ready, and if it cannot be read, there is no
-    prediction.
+    The model is read in a thread; until it is ready, if it cannot be read, and if a file of it was
+    edited after the daemon had read it, there is no prediction. ``digests``: SHA-256 of the files
+    in use, by absolute path; None: whatever the disk holds.
     """
 
-    def __init__(self, settings: DaemonSettings, slices: Mapping[str, slice]) -> None:
-        self._settings, self._slices = settings, slices
+    def __init__(
+        self,
+        settings: DaemonSettings,
+        slices: Mapping[str, slice],
+        digests: Mapping[str, str] | None = None,
+    ) -> None:
+        self._settings, self._slices, self._digests = settings, slices, digests
         self._model: Model | None = None
         self._factor = 1.0  # by which the deflection is magnified in the drawing
-        threading.Thread(target=self._read, daemon=True).start()
+        self.reading = threading.Thread(target=self._read, daemon=True)
+        self.reading.start()
 
     def _read(self) -> None:
         try:
-            model = resolve_name(self._settings.model_source)(self._settings.cell).model
+            with recorded() as files:
+                model = resolve_name(self._settings.model_source)(self._settings.cell).model
+            if not self._are_in_use(files):
+                return
             # compiles before the first use
             q = np.zeros(model.arm.n)
             predict_wrench(model, Motion.at_rest(q[None], Loads()))
@@ -48,6 +60,11 @@ class Prediction:
         self._factor = round_factor(DRAWN * reach(model) / max(float(bend), 1e-5))
         self._model = model
 
+    def _are_in_use(self, files: Mapping[str, bytes]) -> bool:
+        """Return whether the daemon has read the same files, by absolute path."""
+        found = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
+        return self._digests is None or found.items() <= self._digests.items()
+
     def arm(self, row: Array) -> dict[str, Any] | None:
         """Return the arm at a row (width,): joints, TCP, load and a drawing; None: unknown."""
         s, model = self._slices, self._model
@@ -55,11 +72,11 @@ class Prediction:
         if model is None or not np.isfinite(q).all():
             return None
         loads = self._loads(row[None])
-        rigid = skeleton(model.without_terms(), q)
         try:
+            rigid = skeleton(model.without_terms(), q)
             tcp = model.predict(q[None], loads)
             bent = skeleton(model, q, loads)
-        except GapbridgeError:  # no equilibrium under this load
+        except GapbridgeError:  # no equilibrium under this load, or another arm
             return None
         declared = loads.payload_mass is not None
         pull = row[s["actual_TCP_force"]]
