@@ -198,6 +198,26 @@ def test_a_disarming_that_no_loop_has_taken_is_for_the_next(tmp_path: Path, at: 
     assert daemon.loops[1].order["after"] < asked
 
 
+def test_side_processes_are_told_of_a_cell_once_it_is_in_use(tmp_path: Path) -> None:
+    daemon, told = Bench(tmp_path, {"ramps": 0.5}), list[tuple[str, str]]()
+    daemon._reload._in_thread = False
+    daemon.side_processes.emit = lambda event: told.append(  # type: ignore[method-assign]
+        (str(event["kind"]), daemon.configuration.text)
+    )
+    daemon.event_log._listeners = (daemon._on_event, daemon.side_processes.emit)
+    changes = {0.2: f"{CELL}limits: {{offset: -1}}\n", 1.0: f"{CELL}limits: {{offset: 0.002}}\n"}
+
+    def change(text: str) -> None:
+        daemon.settings.cell.write_text(text)
+        daemon.reload()
+
+    for at, text in changes.items():
+        daemon.clock.acts[at] = lambda text=text: change(text)  # type: ignore[misc]
+    daemon.run_until(3.0)
+    found = [(kind, text) for kind, text in told if kind in ("configuration", "cell")]
+    assert found == [("configuration", CELL), ("configuration", CELL), ("cell", changes[1.0])]
+
+
 def test_loops_that_die_are_started_again_more_and_more_slowly(tmp_path: Path) -> None:
     daemon = Bench(tmp_path, *[{"dies": Exit.CRASH}] * 6)
     daemon.run_until(5.0)
