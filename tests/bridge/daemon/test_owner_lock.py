@@ -30,61 +30,68 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
-OwnerLock("host 192.0.2.7", Path("first.yaml")).acquire()
+OwnerLock({address!r}, Path("first.yaml")).acquire()
 print("held", flush=True)
 time.sleep(1000)
 """
 
 
+def at(host: int) -> str:
+    """Return an address that no other process of the tests has, in another checkout either."""
+    return f"host 192.0.2.{host} of {os.getpid()}"
+
+
 def test_a_second_owner_is_refused_in_one_line_and_the_kernel_frees_the_lock() -> None:
-    holder = subprocess.Popen([sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD.format(address=at(7))], stdout=subprocess.PIPE, text=True
+    )
     assert holder.stdout is not None
     assert holder.stdout.readline() == "held\n"
     with pytest.raises(InputError) as reported:
-        OwnerLock("host 192.0.2.7", CELL).acquire()
+        OwnerLock(at(7), CELL).acquire()
     arguments = str(reported.value)
     assert "\n" not in arguments
-    assert "cell.yaml: link: host 192.0.2.7 is in use by another daemon" in arguments
+    assert f"cell.yaml: link: {at(7)} is in use by another daemon" in arguments
     assert f"process {holder.pid}, first.yaml" in arguments
-    OwnerLock("host 192.0.2.8", CELL).acquire()
+    OwnerLock(at(8), CELL).acquire()
     holder.kill()
     holder.wait()
-    with OwnerLock("host 192.0.2.7", CELL) as lock:
+    with OwnerLock(at(7), CELL) as lock:
         assert lock.before["pid"] == holder.pid  # it did not end in order
-    with OwnerLock("host 192.0.2.7", CELL) as lock:
+    with OwnerLock(at(7), CELL) as lock:
         assert lock.before == {}
 
 
 def test_what_was_latched_outlives_an_owner_that_dies_and_the_next_one() -> None:
-    first = OwnerLock("host 192.0.2.9", CELL)
+    first = OwnerLock(at(9), CELL)
     first.acquire()
     first.note({"latched": "robot not ready: protective stop"})
     _let_go_as_the_kernel_does(first)
-    second = OwnerLock("host 192.0.2.9", CELL)
+    second = OwnerLock(at(9), CELL)
     second.acquire()  # dies before it says anything
     _let_go_as_the_kernel_does(second)
-    with OwnerLock("host 192.0.2.9", CELL) as lock:
+    with OwnerLock(at(9), CELL) as lock:
         assert lock.before["latched"] == "robot not ready: protective stop"
-    with OwnerLock("host 192.0.2.9", CELL) as lock:
+    with OwnerLock(at(9), CELL) as lock:
         assert lock.before == {}
 
 
 def test_an_owner_that_died_while_it_wrote_a_shorter_note_did_not_end_in_order() -> None:
-    first = OwnerLock("host 192.0.2.10", CELL)
+    first = OwnerLock(at(10), CELL)
     first.acquire()
     first.note({"latched": 100 * "x"})
     assert first._fd is not None
     os.pwrite(first._fd, b'{"pid": 7}\n', 0)  # and the rest was not cut off any more
     _let_go_as_the_kernel_does(first)
-    with OwnerLock("host 192.0.2.10", CELL) as lock:
+    with OwnerLock(at(10), CELL) as lock:
         assert lock.before == {"pid": 7}
 
 
 def test_an_owner_that_fails_did_not_end_in_order() -> None:
     with pytest.raises(RuntimeError):
-        _own("host 192.0.2.13", "robot not ready: protective stop", RuntimeError())
+        _own(at(13), "robot not ready: protective stop", RuntimeError())
     assert list(state_folder().glob("*.running"))
-    with OwnerLock("host 192.0.2.13", CELL) as lock:
+    with OwnerLock(at(13), CELL) as lock:
         assert lock.before["latched"] == "robot not ready: protective stop"
         assert "did not end in order" in lock.disorder
 
@@ -94,15 +101,15 @@ def test_a_run_that_was_refused_at_its_start_is_as_if_there_had_been_none(
     error: type[Exception],
 ) -> None:
     with pytest.raises(error):
-        _own("host 192.0.2.14", "", error("refused"))
+        _own(at(14), "", error("refused"))
     assert not list(state_folder().glob("*.running"))
     with pytest.raises(RuntimeError):
-        _own("host 192.0.2.14", "zero moved", RuntimeError())
+        _own(at(14), "zero moved", RuntimeError())
     for _ in range(2):  # the robot is off; whoever starts it again still learns of the first
         with pytest.raises(error):
-            _own("host 192.0.2.14", "", error("refused"))
+            _own(at(14), "", error("refused"))
     assert list(state_folder().glob("*.running"))
-    with OwnerLock("host 192.0.2.14", CELL) as lock:
+    with OwnerLock(at(14), CELL) as lock:
         assert lock.before["latched"] == "zero moved"
 
 
@@ -207,35 +214,35 @@ def alive(pid: int) -> bool:
 
 
 def test_the_lock_shows_who_holds_it(tmp_path: Path) -> None:
-    with OwnerLock("host 192.0.2.9", CELL):
+    with OwnerLock(at(9), CELL):
         (path,) = (tmp_path / "gapbridge").glob("*.lock")
         assert json.loads(path.read_text())["cell"] == "cell.yaml"
         assert path.stat().st_mode & 0o777 == 0o600
 
 
 def test_a_run_that_a_power_failure_ended_is_known_though_the_runtime_folder_is_empty() -> None:
-    with OwnerLock("host 192.0.2.10", CELL) as lock:
+    with OwnerLock(at(10), CELL) as lock:
         assert lock.before == {}
-    lock = OwnerLock("host 192.0.2.10", CELL)
+    lock = OwnerLock(at(10), CELL)
     lock.acquire()  # and no release
     assert lock.before == {}
     lock._name.close()
     for path in runtime_folder().glob("*.lock"):
         path.unlink()
-    with OwnerLock("host 192.0.2.10", CELL) as after:
+    with OwnerLock(at(10), CELL) as after:
         assert after.before
         assert after.problem == ""
     assert not list(state_folder().glob("*.running"))
-    with OwnerLock("host 192.0.2.10", CELL) as next_one:
+    with OwnerLock(at(10), CELL) as next_one:
         assert next_one.before == {}
 
 
 @pytest.mark.parametrize("garbage", [b"", b"\0" * 100, b"\xff{"])
 def test_whatever_is_in_the_mark_of_a_run_it_was_a_run(garbage: bytes) -> None:
-    with OwnerLock("host 192.0.2.11", CELL):
+    with OwnerLock(at(11), CELL):
         (mark,) = state_folder().glob("*.running")
     mark.write_bytes(garbage)
-    with OwnerLock("host 192.0.2.11", CELL) as lock:
+    with OwnerLock(at(11), CELL) as lock:
         assert lock.before
 
 
@@ -244,5 +251,5 @@ def test_without_a_state_folder_it_is_said_that_nothing_is_known_of_the_run_befo
 ) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    with OwnerLock("host 192.0.2.12", CELL) as lock:
+    with OwnerLock(at(12), CELL) as lock:
         assert "expected a folder to keep state in" in lock.problem

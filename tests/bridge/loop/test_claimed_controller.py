@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +21,7 @@ from gapbridge.core.errors import LinkError
 from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.controller_address import address_of
 
-ADDRESS = "host 192.0.2.21"
+ADDRESS = f"host 192.0.2.21 of {os.getpid()}"  # no other checkout's
 
 
 class Ends(ByHand):
@@ -57,7 +58,7 @@ def test_a_loop_waits_for_the_one_that_ramps_out_and_says_so_once(other: socket.
 
 
 def test_another_controller_is_not_waited_for(other: socket.socket) -> None:
-    claimed_controller("host 192.0.2.22", no_event, ByHand()).close()
+    claimed_controller(f"{ADDRESS}2", no_event, ByHand()).close()
 
 
 def test_a_loop_that_does_not_end_is_a_failure_at_run_time(other: socket.socket) -> None:
