@@ -43,10 +43,6 @@ class ServiceManager:
         """Report that the run ends."""
         self._send("STOPPING=1")
 
-    def status(self, detail: str) -> None:
-        """Report in one line what goes on."""
-        self._send(f"STATUS={detail.splitlines()[0] if detail else ''}")
-
     def kick(self) -> None:
         """Give a sign of life, where one is due; only to be called when there was progress."""
         now = self._now()

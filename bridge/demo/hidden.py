@@ -21,7 +21,6 @@ class NamedCause:
     """A cause named by the diagnosis; parameters as name, value, standard deviation, unit."""
 
     effect: str
-    joints: tuple[int, ...]
     parameters: tuple[tuple[str, float, float, str], ...]
 
 
@@ -112,7 +111,7 @@ def named_causes(document: Mapping[str, Any]) -> tuple[NamedCause, ...]:
     """Return the causes that a diagnosis names, from its JSON."""
     return tuple(
         NamedCause(
-            cause["effect"], tuple(cause["joints"]),
+            cause["effect"],
             tuple((p["name"], p["value"], p["std"], p["unit"]) for p in cause["parameters"]),
         )
         for channel in document["channels"]

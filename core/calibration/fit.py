@@ -118,7 +118,7 @@ def evaluate_fit(
     remaining = remaining_of(check, diagnosis, complete, missing, state.converged)
     notes = (*fit.notes, *notes_of(problem, state, check, hausman, estimates))
     return Calibration(
-        model=calibrated, nominal=model, readings=readings, estimates=estimates,
+        model=calibrated, readings=readings, estimates=estimates,
         covariance=state.covariance[np.ix_(shown, shown)],
         combinations=(*parameters.redundant, *combinations(parameters, state, shown)),
         before=errors[0], after=errors[1],

@@ -31,7 +31,6 @@ MIN_POSES_TO_DIAGNOSE = 12
 class HeldOutCheck:
     """Test of the held-out residuals against their predicted covariance."""
 
-    held_out: int  # readings
     ratio: float  # mean square over the predicted one; nan without held-out readings
     chance: float  # p-value of the ratio; 1 without held-out readings
     outliers: NDArray[np.int64]  # rows of held-out readings far beyond the predicted spread
@@ -48,7 +47,7 @@ def check_held_out(
     """Return the test of the held-out readings, with noise and uncertainty of the fit."""
     rows = np.flatnonzero(readings.held_out)
     if not len(rows):
-        return HeldOutCheck(0, float("nan"), 1.0, rows)
+        return HeldOutCheck(float("nan"), 1.0, rows)
     part, observable = readings[rows], problem.observable
     residual = observable.residual(calibrated, part, state.nuisance)
     k = residual.shape[1]
@@ -59,7 +58,7 @@ def check_held_out(
     kept = square[~outliers] if (~outliers).sum() >= 3 else square
     ratio = float(kept.sum() / (k * len(kept)))
     chance = float(fisher.sf(ratio, k * len(kept), state.freedom))
-    return HeldOutCheck(len(rows), ratio, chance, rows[outliers])
+    return HeldOutCheck(ratio, chance, rows[outliers])
 
 
 def predicted(problem: Problem, state: FitState, readings: Readings) -> Array:

@@ -60,11 +60,6 @@ class Noise:
         """Return 1 sigma of one joint's repeatability (rad)."""
         return float(self.sizes[-1])
 
-    def arm(self, rows: slice | NDArray[np.bool_] = slice(None)) -> float:
-        """Return 1 sigma of one coordinate from the arm's joints (m), rms over the readings."""
-        part = self.shapes[-1][rows][:, :3, :3]
-        return float(self.joint * np.sqrt(np.mean(np.einsum("nii->ni", part))))
-
     def coordinate(self) -> float:
         """Return 1 sigma of one coordinate, instrument and arm (m), rms over the readings."""
         k = min(self.shapes[0].shape[1], 3)

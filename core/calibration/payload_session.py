@@ -38,7 +38,6 @@ class PayloadCalibration:
     cog: Array  # (3,) m, flange axes
     bias: Array  # (6,) N, Nm: what the sensor reads with nothing on it, flange axes
     estimates: tuple[Estimate, ...]  # in the order of NAMES
-    covariance: Array  # (10, 10)
     noise: tuple[float, float]  # N and Nm, 1 sigma of one axis of one reading
     residual: Array  # (N, 6) reading minus prediction
     outliers: NDArray[np.int64]  # readings down-weighted as outliers
@@ -106,7 +105,7 @@ def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibrati
         for name, v, s, u in zip(NAMES, values, std, UNITS, strict=True)
     )
     return PayloadCalibration(
-        mass, cog, fit.values[4:].copy(), estimates, covariance,
+        mass, cog, fit.values[4:].copy(), estimates,
         (float(fit.noise[0]), float(fit.noise[1])),
         (value - flat @ fit.values).reshape(-1, 6), fit.outliers,
         _notes(mass, float(std[0]), fit.outliers),

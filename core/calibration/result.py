@@ -69,7 +69,6 @@ class Calibration:
     """A fit of a whole session. Errors before and after are over the same rows."""
 
     model: Model  # calibrated
-    nominal: Model  # as the cell had it
     readings: Readings
     estimates: tuple[Estimate, ...]
     covariance: Array  # (p, p) of the estimates that are shown, in their order

@@ -34,7 +34,6 @@ class ToolCalibration:
     tcp: Array  # (3,) m, flange axes
     point: Array  # (3,) m, base: the fixed point
     estimates: tuple[Estimate, ...]  # tool_tcp_x, _y, _z
-    covariance: Array  # (3, 3)
     noise: float  # m, 1 sigma of one coordinate of one touch: operator, arm and model error
     residual: Array  # (N,) m, distance of each touch from the fixed point
     nominal_residual: Array  # (N,) m, the same with the cell's tool, point fitted
@@ -71,7 +70,7 @@ def calibrate_tool(model: Model, q: Array, loads: Loads | None = None) -> ToolCa
     )
     outliers = tuple(int(r) + 1 for r in fit.outliers)
     return ToolCalibration(
-        values[:3].copy(), values[3:].copy(), estimates, fit.covariance[:3, :3].copy(),
+        values[:3].copy(), values[3:].copy(), estimates,
         float(fit.noise[0]), _distances(position, rotation, values),
         _distances(position, rotation, before), fit.outliers,
         (Note(Reason.TOUCHES_DOWN, (outliers,)),) if outliers else (),

@@ -104,7 +104,6 @@ class Diagnosis:
     model: Model = field(repr=False)  # with the causes in it
     with_stand_ins: Model = field(repr=False)  # with causes and stand-ins, fitted together
     sessions: tuple[str, ...] = ()  # names, where there are several
-    one_clock: bool = True  # False: the sessions' timestamps overlap
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -212,7 +211,7 @@ def _diagnose(
         tuple(not_observable), next_measurements(model, log, channels), tuple(reported),
         with_causes(model, model_terms(channels, log)),
         with_causes(model, terms_with_stand_ins(channels, log)),
-        log.session_names, log.one_clock,
+        log.session_names,
     )  # fmt: skip
 
 

@@ -46,7 +46,6 @@ class Message:
     """One message, not yet decoded."""
 
     channel: int
-    sequence: int
     log_time: int  # ns since 1970
     data: bytes
 
@@ -207,8 +206,8 @@ def _contents(data: bytes) -> Contents:
         code, length = head.unpack_from(data, offset)
         offset += 9
         if code == Opcode.MESSAGE:
-            channel, sequence, log_time, _ = message.unpack_from(data, offset)
-            add(Message(channel, sequence, log_time, data[offset + 22 : offset + length]))
+            channel, _, log_time, _ = message.unpack_from(data, offset)
+            add(Message(channel, log_time, data[offset + 22 : offset + length]))
         elif code == Opcode.SCHEMA:
             contents.schemas.append(Schema.read(_stream(data, offset, length)))
         elif code == Opcode.CHANNEL:

@@ -23,17 +23,16 @@ UNIDENTIFIED = 0.95  # of the prior's sigma: a larger std counts as not identifi
 
 @dataclass(frozen=True)
 class Reference:
-    """M poses and loads at which the accuracy of the predicted TCP is evaluated."""
+    """M poses at which the accuracy of the predicted TCP is evaluated."""
 
     q: Array  # (M, n) rad
-    loads: Loads
     columns: Array  # (M, 3, p) d TCP / d parameter, m per prior sigma
 
     @classmethod
     def of(cls, parameters: Parameters, q: Array, loads: Loads) -> Reference:
-        """Return the reference at poses ``q`` (M, n)."""
+        """Return the reference at poses ``q`` (M, n) under their loads."""
         columns = parameters.tcp_jacobian(parameters.begin, q, loads)
-        return cls(q, loads, columns * parameters.prior)
+        return cls(q, columns * parameters.prior)
 
     def weight(self, size: int, share: Array | None = None) -> Array:
         """Return W (size, size): trace(W covariance) is the mean square TCP error, m^2.

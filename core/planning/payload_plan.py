@@ -33,7 +33,6 @@ class PayloadPlan:
     names: tuple[str, ...]
     units: tuple[str, ...]
     std: Array  # (10,) expected 1 sigma of each
-    bought: tuple[tuple[int, float, float], ...]  # poses, 1 sigma of mass (kg), of the cog (m)
 
 
 def plan_payload(
@@ -61,11 +60,9 @@ def plan_payload(
     columns[:, :, 1:4] *= mass  # the centre of gravity itself, at about this mass
     scale = np.array([1.0, *[0.1] * 3, *[noise[0]] * 3, *[noise[1]] * 3])
     chosen = select_d_optimal(columns * scale, MAX_POSES if poses is None else poses)
-    bought = []
     std = np.full(10, np.inf)
     for count in range(MIN_POSES if poses is None else min(poses, 4), len(chosen) + 1):
         std = _std(columns[chosen[:count]])
-        bought.append((count, float(std[0]), float(std[1:4].max())))
         enough = all(std[NAMES.index(name)] <= target for name, target in TARGET_STD.items())
         if poses is None and enough:
             chosen = chosen[:count]
@@ -75,9 +72,7 @@ def plan_payload(
             "payload session: within the joint limits the wrist cannot turn the flange far enough "
             "to separate load from sensor bias; begin elsewhere"
         )
-    return PayloadPlan(
-        tuple(ordered_poses(candidates[chosen], begin)), NAMES, UNITS, std, tuple(bought)
-    )
+    return PayloadPlan(tuple(ordered_poses(candidates[chosen], begin)), NAMES, UNITS, std)
 
 
 def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:

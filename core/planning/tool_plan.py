@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.tool_session import NAMES, touch_columns
+from gapbridge.core.calibration.tool_session import touch_columns
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
@@ -28,8 +28,6 @@ class ToolPlan:
     """The poses of a session, in the order of travel; the first is where it begins."""
 
     poses: tuple[Array, ...]  # (n,) rad each, tip (as the cell knows it) on the fixed point
-    names: tuple[str, ...]
-    std: Array  # (3,) m, expected 1 sigma of the tip
     bought: tuple[tuple[int, float], ...]  # touches, expected 1 sigma of the tip (m, 3D)
 
 
@@ -56,7 +54,7 @@ def plan_tool(
             "tool session: the arm cannot turn the tool far enough about that point within its "
             "joint limits; expected a point in front of the arm, tool pointing down"
         )
-    return ToolPlan(tuple(ordered_poses(candidates[chosen], begin)), NAMES, std, tuple(bought))
+    return ToolPlan(tuple(ordered_poses(candidates[chosen], begin)), tuple(bought))
 
 
 def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:

@@ -226,7 +226,7 @@ class _Loading:
         out = OutgoingLoading(self.names)
         sends = frozenset(self.names.key(identifier) for identifier in file.sends)
         profile = CanProfile(
-            name=file.name, path=str(self.document.path), n=self.n, rate=file.rate,
+            name=file.name, n=self.n, rate=file.rate,
             incoming=self._incoming(), joints=joints,
             sample=tuple(
                 self.names.message(name, ("sample", "messages", i))[1]

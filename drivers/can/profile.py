@@ -118,7 +118,6 @@ class CanProfile:
     """One arm's map, checked."""
 
     name: str
-    path: str
     n: int
     rate: float  # Hz
     incoming: dict[Key, Incoming]

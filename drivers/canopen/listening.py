@@ -40,8 +40,6 @@ class Emergency:
 
     node: int
     code: int
-    register: int
-    seen: float  # s, monotonic
 
     def __str__(self) -> str:
         return f"node {self.node}: EMCY 0x{self.code:04X}"
@@ -120,7 +118,7 @@ class HeartbeatMonitor:
 
     def _emergency_of(self, node: int, consumer: Any) -> Any:
         def note(error: Any) -> None:
-            emergency = Emergency(node, error.code, error.register, self._now())
+            emergency = Emergency(node, error.code)
             self.log.append(emergency)
             if error.code & 0xFF00:
                 self.active[node] = emergency

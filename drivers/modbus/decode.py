@@ -53,7 +53,7 @@ class Decoder:
     """Decodes the blocks of one profile; each reading independently of those before."""
 
     def __init__(self, profile: ProfileFile, compiled: RegisterMap) -> None:
-        self._profile, self._map = profile, compiled
+        self._map = compiled
         self._fields = [
             self._field(str(keys[1]), entry, count)
             for keys, _, entry, count in vectors(profile)

@@ -94,7 +94,6 @@ def mean(values: Array) -> Array:
 class Revisit:
     """An earlier pose, measured again."""
 
-    before: Reading
     now: Reading
     shift: Array  # (3,) or (k,) m, change of the reading, motion of the arm subtracted
 
@@ -365,7 +364,7 @@ class Measuring:
             session.readings(kind, [before]), session.readings(kind, [now]),
             session.readings(kind, [r for r in session.accepted[:-1] if not r.doubted]),
         )  # fmt: skip
-        return Revisit(before, now, shift)
+        return Revisit(now, shift)
 
     def _ask_what_moved(self, revisits: list[Revisit], first: int) -> None:
         """Report what has moved, ask for confirmation, and start a new station or target."""

@@ -70,7 +70,6 @@ class ModbusServer(ProtocolServer):
         self._server: Any = None
         self._thread: threading.Thread | None = None
         self._failure: Exception | None = None
-        self._clients: set[Any] = set()
 
     # -- the thread -------------------------------------------------------------------------------
 

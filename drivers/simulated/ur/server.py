@@ -34,9 +34,8 @@ LATE = 0.1  # s: behind by more than this, the missed cycles are left out
 
 @dataclass(slots=True)
 class Listener:
-    """A port: its socket, and handlers for new clients and their data."""
+    """A port's handlers for new clients and their data."""
 
-    sock: socket.socket
     accept: Callable[[socket.socket], Connection]
     handle: Callable[[Connection], None]
 
@@ -81,7 +80,7 @@ class Server:
         accept: Callable[[socket.socket], Connection],
         handle: Callable[[Connection], None],
     ) -> None:
-        self._listeners[sock] = Listener(sock, accept, handle)
+        self._listeners[sock] = Listener(accept, handle)
 
     def _greeted(self, sock: socket.socket) -> Connection:
         connection = Connection(sock)

@@ -127,9 +127,7 @@ def judged(link: DemoLink, tmp_path: Path) -> tuple[list[str], float, float]:
     causes = [c for ch in diagnose(calibrated.model, log, calibrated.metrology).channels
               for c in ch.causes]  # fmt: skip
     accused = [
-        NamedCause(
-            c.effect, c.joints, tuple((p.name, p.value, p.std or 0.0, p.unit) for p in c.parameters)
-        )
+        NamedCause(c.effect, tuple((p.name, p.value, p.std or 0.0, p.unit) for p in c.parameters))
         for c in causes
     ]
     terms = [term for c in causes for term in c.terms]

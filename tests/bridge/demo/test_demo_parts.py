@@ -406,7 +406,7 @@ def test_a_run_that_no_stall_ended_is_a_failure_at_once(broke):
 
 
 def named_cause(*parameters: tuple[str, float, float], effect: str = "tool_frame") -> NamedCause:
-    return NamedCause(effect, (), tuple((name, value, std, "m") for name, value, std in parameters))
+    return NamedCause(effect, tuple((name, value, std, "m") for name, value, std in parameters))
 
 
 def bent(**shift: float) -> HiddenEffects:

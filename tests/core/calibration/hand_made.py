@@ -45,7 +45,7 @@ def hand_made(
         "instrument_noise": 1e-5, "freedom": 60.0,
     } | given  # fmt: skip
     return Calibration(
-        model=model, nominal=model, readings=readings, estimates=estimates,
+        model=model, readings=readings, estimates=estimates,
         covariance=np.zeros((0, 0)) if covariance is None else covariance, combinations=(),
         before=part(before, ~held), after=part(error, ~held), held_out_before=part(before, held),
         held_out_after=part(error, held), outliers=np.zeros(0, dtype=np.int64), stations=(frame,),

@@ -23,8 +23,6 @@ class DashboardServer:
 
     def __init__(self, controller: Controller, version: str, serial: str) -> None:
         self._controller = controller
-        self._version = version
-        self._serial = serial
         self._role = "NONE"
         self._plain: dict[str, Callable[[], str]] = {
             "play": self._play,

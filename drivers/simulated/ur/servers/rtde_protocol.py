@@ -65,7 +65,6 @@ def _types(names: list[str], table: Mapping[str, str]) -> list[str]:
 class OutputRecipe:
     """A configured output list: packs a whole data frame from the controller's memory."""
 
-    names: tuple[str, ...]
     types: tuple[str, ...]
     plan: tuple[tuple[str, bool], ...]
     layout: struct.Struct
@@ -96,14 +95,13 @@ def output_recipe(names: list[str], version: int, every: int) -> OutputRecipe:
     start = ">HBB" if version == 2 else ">HB"
     layout = struct.Struct(start + "".join(FORMATS[t][0] for _, t in available))
     head = (layout.size, DATA, 1) if version == 2 else (layout.size, DATA)
-    return OutputRecipe(tuple(names), tuple(types), plan, layout, head, every)
+    return OutputRecipe(tuple(types), plan, layout, head, every)
 
 
 @dataclass(frozen=True, slots=True)
 class InputRecipe:
     """A configured input list: turns the payload of a client's data frame into values."""
 
-    names: tuple[str, ...]
     plan: tuple[tuple[str, int], ...]
     layout: struct.Struct
 
@@ -140,4 +138,4 @@ def input_recipe(names: list[str]) -> InputRecipe | None:
         return None
     plan = tuple((n, FORMATS[INPUTS[n]][1]) for n in names)
     layout = struct.Struct(">" + "".join(FORMATS[INPUTS[n]][0] for n in names))
-    return InputRecipe(tuple(names), plan, layout)
+    return InputRecipe(plan, layout)
