@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Self
 
+import numpy as np
+
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.run_settings import settings_of
@@ -169,7 +171,11 @@ class Session:
             self._runs.append(summary)
         if summary is None or error or summary.recording is None:
             return RunOutcome(None, error or "nothing was recorded", stalled)
-        recording = read_columns(summary.recording, reported_only=True)
+        recording = {
+            name: values
+            for name, values in read_columns(summary.recording).items()
+            if not np.isnan(values).all()  # NaN throughout: the controller does not report it
+        }
         measured, missing = measurements_at(recording, readings, poses, load, self._link.settling)
         if summary.faults:
             return RunOutcome(measured, summary.faults[0], stalled, summary.cause)

@@ -112,7 +112,10 @@ def evaluate_fit(
     estimates = fit.estimates(expected)
     shown = np.array([e.shown for e in estimates], dtype=bool)
     errors = _errors(model, calibrated, observable, readings, state.nuisance)
-    hausman = _hausman_chance(problem, state)
+    hausman = hausman_chance(
+        state.system, problem.stages, state.covariance, problem.bounds, observable.equations,
+        np.sqrt(state.weights),
+    )  # fmt: skip
     complete = state.converged and check.is_consistent and not missing
     complete = complete and (diagnosis is None or diagnosis.verdict is Verdict.NO_GAP)
     remaining = remaining_of(check, diagnosis, complete, missing, state.converged)
@@ -213,13 +216,6 @@ def _rotation_noise(observable: Observable, noise: Noise) -> float:
     if len(noise.sizes) < 3:
         return float("nan")
     return float(noise.sizes[1] * observable.sigmas[3])
-
-
-def _hausman_chance(problem: Problem, state: FitState) -> float | None:
-    return hausman_chance(
-        state.system, problem.stages, state.covariance, problem.bounds,
-        problem.observable.equations, np.sqrt(state.weights),
-    )  # fmt: skip
 
 
 def tcp_deviation(parameters: Parameters, state: FitState, readings: Readings) -> Array:

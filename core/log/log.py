@@ -91,16 +91,13 @@ class Log:
         """
         for name in names:
             if name in self.columns:
-                self._check_finite(name)
+                self._refuse(name, ~np.isfinite(self.columns[name]), "a finite number")
                 return self.columns[name]
         wanted = " or ".join(written(name, self.n) for name in names)
         hint = did_you_mean(self.unknown, names, self.n)
         raise LogError(
             f"{self.path}: columns: found no {wanted}, expected them for this command{hint}"
         )
-
-    def _check_finite(self, name: str) -> None:
-        self._refuse(name, ~np.isfinite(self.columns[name]), "a finite number")
 
     def check_size(self) -> None:
         """Raise LogError, naming row and column, for a number too large to calculate with."""

@@ -90,19 +90,11 @@ def read_configuration(path: Path) -> Document:
     raise LogError(f"{path}: found no configuration, expected one at the beginning of a recording")
 
 
-def read_columns(path: Path, reported_only: bool = False) -> dict[str, Array]:
-    """Return all cycles of a recording by field name, empty where there are none.
-
-    ``reported_only``: without what the controller never reported, which is NaN throughout.
-    """
+def read_columns(path: Path) -> dict[str, Array]:
+    """Return all cycles of a recording by field name, empty where there are none."""
     batches = [batch.columns for batch in read_batches(path) if len(batch)]
     names = list(batches[0]) if batches else []
-    joined = {name: np.concatenate([columns[name] for columns in batches]) for name in names}
-    return {
-        name: values
-        for name, values in joined.items()
-        if not (reported_only and np.isnan(values).all())
-    }
+    return {name: np.concatenate([columns[name] for columns in batches]) for name in names}
 
 
 def last_batch(path: Path) -> Batch | None:

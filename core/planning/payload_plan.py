@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.payload_session import NAMES, UNITS, weight_columns
+from gapbridge.core.calibration.payload_session import NAMES, weight_columns
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
 from gapbridge.core.planning.travel import ordered_poses
@@ -30,9 +30,7 @@ class PayloadPlan:
     """The poses of a session with the flange sensor, in the order of travel."""
 
     poses: tuple[Array, ...]  # (n,) rad each
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    std: Array  # (10,) expected 1 sigma of each
+    std: Array  # (10,) expected 1 sigma of each of payload_session.NAMES
 
 
 def plan_payload(
@@ -40,24 +38,22 @@ def plan_payload(
     begin: Array,
     *,
     poses: int | None = None,
-    mass: float | None = None,
     noise: tuple[float, float] = TYPICAL_NOISE,
     seed: int = 0,
 ) -> PayloadPlan:
     """Return poses around ``begin`` (n,) rad that separate load and sensor bias best (D-optimal).
 
-    Only the last three joints move, within their limits. ``mass`` (kg; default: the model's) is the
-    expected payload, ``noise`` 1 sigma of one axis of an averaged reading (N, Nm). With ``poses``
-    None, the number is the smallest (6 to 20) that determines mass to 20 g and the centre of
-    gravity to 2 mm. Raises ExcitationError where the limits leave no orientations that separate
-    load from bias.
+    Only the last three joints move, within their limits. The expected payload is the model's;
+    ``noise`` is 1 sigma of one axis of an averaged reading (N, Nm). With ``poses`` None, the number
+    is the smallest (6 to 20) that determines mass to 20 g and the centre of gravity to 2 mm. Raises
+    ExcitationError where the limits leave no orientations that separate load from bias.
     """
     begin = np.asarray(begin, dtype=float)
     candidates = _candidates(model, begin, np.random.default_rng(seed))
-    mass = max(model.payload_mass, 0.5) if mass is None else max(mass, 1e-3)
     sigma = np.repeat(noise, 3)
     columns = weight_columns(model, candidates) / sigma[None, :, None]
-    columns[:, :, 1:4] *= mass  # the centre of gravity itself, at about this mass
+    # the centre of gravity itself, at about this mass
+    columns[:, :, 1:4] *= max(model.payload_mass, 0.5)
     scale = np.array([1.0, *[0.1] * 3, *[noise[0]] * 3, *[noise[1]] * 3])
     chosen = select_d_optimal(columns * scale, MAX_POSES if poses is None else poses)
     std = np.full(10, np.inf)
@@ -72,7 +68,7 @@ def plan_payload(
             "payload session: within the joint limits the wrist cannot turn the flange far enough "
             "to separate load from sensor bias; begin elsewhere"
         )
-    return PayloadPlan(tuple(ordered_poses(candidates[chosen], begin)), NAMES, UNITS, std)
+    return PayloadPlan(tuple(ordered_poses(candidates[chosen], begin)), std)
 
 
 def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:

@@ -63,11 +63,6 @@ class SyncCollector:
             self._over.clear()
             self._synced = self._received = now
 
-    def end(self) -> None:
-        """Accept nothing until the next SYNC."""
-        with self._lock:
-            self._open = False
-
     def take(self, cob_id: int, data: bytes, now: float) -> None:
         """Add one frame. Raises nothing; ignores frames that are no TPDO of the profile."""
         member = self._members.get(cob_id)

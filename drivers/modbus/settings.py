@@ -84,11 +84,6 @@ class ModbusSettings(ProfileSettings):
 
         return read_profile(self.profile_path).write.mode != "mailbox"
 
-    @property
-    def address(self) -> str:
-        """Return the controller's name in messages."""
-        return self.serial or self.host if self.transport == "rtu" else self.host
-
     def read_files(self) -> None:
         """Read the profile; see DriverSettings."""
         from gapbridge.drivers.modbus.profile import read_profile

@@ -23,7 +23,7 @@ from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.settings.instruments import Base, PointSettings
 from gapbridge.bridge.document.notes import note_text
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.payload_session import calibrate_payload
+from gapbridge.core.calibration.payload_session import NAMES, UNITS, calibrate_payload
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.calibration.tool_session import calibrate_tool
 from gapbridge.core.notes import Reason
@@ -127,7 +127,7 @@ class PayloadJob(_ShortJob):
             self.cell.model, begin, poses=self.options.poses, seed=self.options.seed
         )
         expected = Expectation(
-            result.names, result.units, result.std, np.full(len(result.std), np.nan), np.nan, np.nan
+            NAMES, UNITS, result.std, np.full(len(result.std), np.nan), np.nan, np.nan
         )
         return short_plan((load,), _planned_poses(result.poses), expected=expected)
 

@@ -76,11 +76,6 @@ class Hub:
         with self._lock:
             self._ports[port.fd] = port
 
-    def detach(self, port: Port) -> None:
-        """Detach such a port; may be repeated."""
-        with self._lock:
-            self._ports.pop(port.fd, None)
-
     def close(self) -> None:
         """Close every connection; may be repeated."""
         self._stopping = True

@@ -57,8 +57,6 @@ class PlantArm:
     lower: tuple[float, ...]  # rad
     upper: tuple[float, ...]  # rad
     velocity: tuple[float, ...]  # rad/s
-    effort: tuple[float, ...]  # Nm
-    payload: float  # kg, rated
 
     @property
     def reach(self) -> float:
@@ -131,6 +129,4 @@ def plant_arm(arm: Arm | str, joints: int | None = None) -> PlantArm:
         lower=tuple(limits.lower.tolist()),
         upper=tuple(limits.upper.tolist()),
         velocity=tuple(np.minimum(limits.velocity, FASTEST).tolist()),
-        effort=tuple(limits.effort.tolist()),
-        payload=float(arm.payload),
     )

@@ -128,9 +128,8 @@ def test_a_bare_flange_weighs_nothing_and_has_no_centre(model: Model) -> None:
 
 
 def test_planned_orientations_are_as_accurate_as_predicted(model: Model) -> None:
-    plan = plan_payload(model, BEGIN, mass=2.0, noise=(FORCE, TORQUE))
+    plan = plan_payload(replace(model, payload_mass=2.0), BEGIN, noise=(FORCE, TORQUE))
     assert all(np.array_equal(q[:3], BEGIN[:3]) for q in plan.poses)
-    assert plan.bought[-1][0] == len(plan.poses)
     q = np.array(plan.poses)
     found, rng = [], np.random.default_rng(9)
     for _ in range(60):

@@ -67,11 +67,6 @@ class OffsetMotion:
         """Move the robot's own motion to `goal` (n, rad)."""
         self.own = MoveJoints(self._nominal, goal, speed, acceleration)
 
-    @property
-    def nominal(self) -> Joints:
-        """Target joints of the robot's own program (n, rad)."""
-        return self._nominal
-
     def restart(self, q: Joints) -> None:
         """Continue after a pause: the own motion restarts from `q` without the offset."""
         if self.applied != NOTHING:
