@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import inspect
 import os
+from collections import Counter
 
 import click
 
 from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect, effect_named, ties_of
+
+ARM = "ur10e"  # has parallel axes, between which a link has one more parameter
 
 
 @click.command()
@@ -32,9 +35,7 @@ def explain(effect: str | None) -> None:
 
 def explanation_text(effect: Effect) -> str:
     """Return the description, needed data and parameters of an effect."""
-    # slow to import, not needed by the list
-    from gapbridge.bridge.document.effect_parameters import ARM, parameter_texts
-    from gapbridge.core.arm import builtin_arm
+    from gapbridge.core.arm import builtin_arm  # slow to import, not needed by the list
 
     sites = effect.sites(builtin_arm(ARM))
     channels = ", ".join(f"{name} ({CHANNELS[name]})" for name in effect.channels)
@@ -49,6 +50,21 @@ def explanation_text(effect: Effect) -> str:
     lines.append("parameters in a cell file:")
     lines += [f"  {name} ({unit})" for name, unit in parameter_texts(effect)]
     return "\n".join(lines)
+
+
+def parameter_texts(effect: Effect) -> list[tuple[str, str]]:
+    """Return name and unit of each parameter; the unit says where some joints do not have it."""
+    from gapbridge.core.arm import builtin_arm
+
+    arm = builtin_arm(ARM)
+    sites = effect.sites(arm)
+    found = [parameter for site in sites for parameter in effect.parameters(arm, site)]
+    count = Counter(parameter.name for parameter in found)
+    units = {parameter.name: parameter.unit or "no unit" for parameter in found}
+    return [
+        (name or "value", unit if count[name] == len(sites) else f"{unit}, not of every joint")
+        for name, unit in units.items()
+    ]
 
 
 def _text(effect: Effect) -> str:

@@ -2,14 +2,14 @@
 
 import inspect
 
+from benchmarks.evidence.catalogue_page import PAGE, catalogue_page, main
 from gapbridge.bridge.cli.cell.explain import explanation_text
-from gapbridge.bridge.report.catalogue_page import PAGE, catalogue_page, main
 from gapbridge.core.effects import CATALOGUE
 
 
 def test_the_committed_page_is_fresh():
     assert PAGE.read_text(encoding="utf-8") == catalogue_page(), (
-        "run python -m gapbridge.bridge.report.catalogue_page"
+        "run python -m benchmarks.evidence.catalogue_page"
     )
 
 

@@ -1,6 +1,6 @@
 """Generate docs/catalogue.md from the docstrings of the effects.
 
-Example: python -m gapbridge.bridge.report.catalogue_page docs/catalogue.md
+Example: python -m benchmarks.evidence.catalogue_page docs/catalogue.md
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import inspect
 import sys
 from pathlib import Path
 
-from gapbridge.bridge.document.effect_parameters import parameter_texts
+from gapbridge.bridge.cli.cell.explain import ARM, parameter_texts
 from gapbridge.bridge.report.labels import CHANNELS as CHANNEL_TITLES
 from gapbridge.bridge.report.labels import effect_title
 from gapbridge.core.arm import builtin_arm
@@ -19,7 +19,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "catalogue.md"
 HEAD = """\
 # The catalogue of effects
 
-Generated from the effects' docstrings by `python -m gapbridge.bridge.report.catalogue_page`;
+Generated from the effects' docstrings by `python -m benchmarks.evidence.catalogue_page`;
 do not edit.
 `gapbridge explain EFFECT` prints the same text. Parameters are what the real arm has more than the
 model, in SI units.
@@ -45,7 +45,7 @@ def _table(channel: str) -> str:
 
 
 def _place(effect: Effect) -> str:
-    return "one joint each" if effect.sites(builtin_arm("ur10e"))[0].joint else "the whole arm"
+    return "one joint each" if effect.sites(builtin_arm(ARM))[0].joint else "the whole arm"
 
 
 def _effect(effect: Effect) -> str:
