@@ -23,12 +23,12 @@ from gapbridge.drivers.clock import SYSTEM
 
 CODE = """
 import ctypes, json, signal, sys
-from pathlib import Path
+from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cli import main
 from gapbridge.bridge.daemon.run import run_cell
 def emit(event):
     print(json.dumps(event, default=str), file=sys.stderr, flush=True)
-sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=emit))
+sys.exit(run_cell(load_cell(sys.argv[1]), arm=True, log=emit))
 """
 PAGE_LIMIT = 90.0  # s
 LOOK_EVERY = 0.02  # s between two looks for the memory of a new loop

@@ -7,18 +7,16 @@ import signal
 import threading
 from collections.abc import Callable
 from datetime import datetime
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import click
 
-from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
-from gapbridge.bridge.daemon.daemon import Daemon, Say
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.daemon.output import Output
 from gapbridge.bridge.daemon.runnable import require_runnable
-from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.events import Event
 from gapbridge.drivers.clock import SYSTEM
 
@@ -26,7 +24,7 @@ LONGEST_OUTPUT = 1.0  # s that the end waits for a blocked terminal or pipe
 
 
 def run_cell(
-    cell: Cell | Path,
+    cell: Cell,
     observe: bool = False,
     arm: bool = False,
     duration: float | None = None,
@@ -34,19 +32,24 @@ def run_cell(
 ) -> int:
     """Run a cell's daemon until it is stopped, its trajectory ends or ``duration`` s are over.
 
-    Prints what happens and a summary; returns the exit code. Raises InputError for a cell that
-    cannot be run, LinkError where the robot cannot be reached. ``log`` gets every event.
+    Prints what happens and a summary; returns the exit code. SIGINT and SIGTERM stop it, SIGHUP
+    reads the cell file again. ``log`` gets every event. Raises InputError for a cell that cannot be
+    run, LinkError where the robot cannot be reached.
     """
-    cell = cell if isinstance(cell, Cell) else load_cell(cell)
     configuration = read_configuration(cell.path)
     require_runnable(cell, configuration.settings, SYSTEM)
     output = Output(click.echo, SYSTEM)
     echo = output.behind(click.echo)
     try:
-        summary = run_daemon(
-            configuration, observe, arm, duration, lambda text: echo(_with_time(text)),
+        daemon = Daemon(
+            configuration, not observe, SYSTEM, lambda text: echo(_with_time(text)),
             None if log is None else output.behind(log),
         )  # fmt: skip
+        wanted = not observe and (arm or configuration.settings.setpoints.arm)
+        with _signals(daemon):
+            summary = daemon.run(
+                arm=wanted, duration=duration, by="--arm" if arm else "the cell file"
+            )
         for line in summary.lines():
             echo(line)
     finally:
@@ -58,25 +61,6 @@ def run_cell(
 def _with_time(text: str) -> str:
     now = datetime.fromtimestamp(SYSTEM.time())
     return f"{now:%H:%M:%S}.{now.microsecond // 1000:03d} {text}"
-
-
-def run_daemon(
-    configuration: Configuration,
-    observe: bool = False,
-    arm: bool = False,
-    duration: float | None = None,
-    say: Say = lambda _: None,
-    log: Callable[[Event], None] | None = None,
-) -> RunSummary:
-    """Run the daemon and return how it went; see ``run_cell``.
-
-    Stops on SIGINT and SIGTERM, reads the cell file again on SIGHUP.
-    """
-    daemon = Daemon(configuration, not observe, SYSTEM, say, log)
-    by = "--arm" if arm else "the cell file"
-    wanted = not observe and (arm or configuration.settings.setpoints.arm)
-    with _signals(daemon):
-        return daemon.run(arm=wanted, duration=duration, by=by)
 
 
 class _signals:  # noqa: N801
