@@ -80,11 +80,10 @@ class Rectangle(_AtPoint):
 
 @dataclass(frozen=True)
 class Circle(_AtPoint):
-    """A circle, filled or not."""
+    """A filled circle."""
 
     radius: float
-    fill: str = ""
-    stroke: Stroke | None = None
+    fill: str
     opacity: float = 1.0
     hint: str = ""
 

@@ -30,21 +30,20 @@ from gapbridge.bridge.document.pdf_text import BOLD, PLAIN, STYLES, badge_markup
 SIDE, TOP, BOTTOM = 18 * mm, 16 * mm, 18 * mm
 WIDTH = A4[0] - 2 * SIDE
 MIN_SPACE = 120  # pt, for a heading and the first rows of a long table
+GAP, LARGEST_SCALE = 16.0, 0.76  # between drawings in a row, pt; and of them
 MAX_UNSPLIT_ROWS = 14  # of a table that is kept on one page
 
 
 class DrawnRow(Flowable):
     """Drawings in a row, scaled down together where they are wider than the page."""
 
-    def __init__(
-        self, drawings: tuple[drawn.Drawing, ...], gap: float = 16.0, largest: float = 0.76
-    ):
+    def __init__(self, drawings: tuple[drawn.Drawing, ...]) -> None:
         super().__init__()
-        self.drawings, self.gap, self.scale = drawings, gap, largest
+        self.drawings, self.scale = drawings, LARGEST_SCALE
 
     def wrap(self, available_width: float, available_height: float) -> tuple[float, float]:
         """Return the size that the row takes, pt."""
-        gaps = self.gap * (len(self.drawings) - 1)
+        gaps = GAP * (len(self.drawings) - 1)
         wanted = sum(d.width for d in self.drawings)
         self.scale = min(self.scale, (available_width - gaps) / wanted)
         return available_width, max(d.height for d in self.drawings) * self.scale + 4
@@ -61,7 +60,7 @@ class DrawnRow(Flowable):
             for shape in drawing.shapes:
                 _shape(canvas, shape)
             canvas.restoreState()
-            x += drawing.width * self.scale + self.gap
+            x += drawing.width * self.scale + GAP
 
 
 def pdf(document: blocks.Document) -> bytes:
@@ -202,14 +201,9 @@ def _shape(canvas: Canvas, shape: drawn.Shape) -> None:
         canvas.setStrokeAlpha(1.0)
         canvas.setLineCap(0)
     elif isinstance(shape, drawn.Circle):
-        if shape.stroke:
-            _stroke(canvas, shape.stroke)
-        if shape.fill:
-            canvas.setFillColor(HexColor(drawn.PALETTE[shape.fill]))
-            canvas.setFillAlpha(shape.opacity)
-        canvas.circle(
-            shape.x, -shape.y, shape.radius, int(bool(shape.stroke)), int(bool(shape.fill))
-        )
+        canvas.setFillColor(HexColor(drawn.PALETTE[shape.fill]))
+        canvas.setFillAlpha(shape.opacity)
+        canvas.circle(shape.x, -shape.y, shape.radius, 0, 1)
         canvas.setFillAlpha(1.0)
     else:
         _text(canvas, shape)

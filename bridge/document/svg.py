@@ -63,12 +63,10 @@ def _shape(shape: Shape) -> str:
             f'stroke-opacity="{_number(shape.opacity)}"/>'
         )
     if isinstance(shape, Circle):
-        stroke = _stroke(shape.stroke) if shape.stroke else ""
-        fill = f"var(--{shape.fill})" if shape.fill else "none"
         solid = "" if shape.opacity == 1.0 else f' fill-opacity="{_number(shape.opacity)}"'
         return (
             f'<circle cx="{_number(shape.x)}" cy="{_number(shape.y)}" r="{_number(shape.radius)}" '
-            f'fill="{fill}"{solid} {stroke}>{_hint(shape.hint)}</circle>'
+            f'fill="var(--{shape.fill})"{solid}>{_hint(shape.hint)}</circle>'
         )
     return _text(shape)
 

@@ -105,15 +105,12 @@ def over_the_workspace(data: CalibrationData) -> list[Block]:
         for view, axes in ERROR_VIEWS.items():
             title = f"{name}, {view}"
             drawings.append(_view(title, axes, tcp, errors.vector * factor, colour))
+    selection = "All readings except outliers." if data.outlier_rows else "All readings."
     caption = (
-        f"{_selection_text(data)} Errors before are magnified {factors[0]:,.0f} times,"
+        f"{selection} Errors before are magnified {factors[0]:,.0f} times,"
         f" errors after {factors[1]:,.0f} times. Axes of the base; the square is the base."
     )
     return [Paragraph(about, "note"), Pictures(tuple(drawings), caption), zones]
-
-
-def _selection_text(data: CalibrationData) -> str:
-    return "All readings except outliers." if data.outlier_rows else "All readings."
 
 
 def _arrow_scale(errors: Errors, size: float) -> float:
