@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
+from abc import abstractmethod
 from typing import Any
 
 import can
@@ -16,7 +18,40 @@ RANGE = np.array((600.0, 600.0, 600.0, 60.0, 60.0, 60.0))  # N, Nm at about full
 FULL = 30000.0  # gauge counts
 
 
-class AtiNode(SimulatedSensor):
+class _CanNode(SimulatedSensor):
+    """A sensor on a CAN bus; it hears ``first`` and identifiers like it in the bits of ``mask``."""
+
+    def __init__(self, reaction: Reaction, bus: BusSettings, first: int, mask: int) -> None:
+        super().__init__(reaction)
+        self._settings = bus
+        self._filter = can.typechecking.CanFilter(can_id=first, can_mask=mask, extended=False)
+        self._bus: Any = None
+
+    def open(self) -> None:
+        """Open the bus."""
+        self._bus = open_bus(self._settings, [self._filter])
+
+    def serve(self) -> None:
+        """Serve until the end, or until the bus is lost."""
+        with contextlib.suppress(can.CanError, OSError):
+            self._serve_bus()
+
+    @abstractmethod
+    def _serve_bus(self) -> None:
+        """Serve until ``_ended`` is set."""
+
+    def _send(self, identifier: int, data: bytes) -> None:
+        frame = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+        self._bus.send(frame, timeout=0.1)
+
+    def close_wire(self) -> None:
+        """Leave the bus."""
+        if self._bus is not None:
+            close_bus(self._bus)
+            self._bus = None
+
+
+class AtiNode(_CanNode):
     """Answers questions; its gauges are mixed by a matrix that is drawn from the seed.
 
     ``units``: codes of force and torque unit, with what one unit is in N and in Nm.
@@ -30,9 +65,8 @@ class AtiNode(SimulatedSensor):
         seed: int = 0,
         units: tuple[tuple[int, float], tuple[int, float]] = ((2, 1.0), (3, 1.0)),
     ) -> None:
-        super().__init__(reaction)
-        self._settings, self._base = bus, base_id << 4
-        self._bus: Any = None
+        self._base = base_id << 4
+        super().__init__(reaction, bus, self._base, 0x7F0)
         (self._force_code, newton), (self._torque_code, newton_metre) = units
         self._counts = (1_000_000, 500_000)  # per unit of force, of torque
         scale = np.array(3 * (self._counts[0] / newton,) + 3 * (self._counts[1] / newton_metre,))
@@ -41,12 +75,6 @@ class AtiNode(SimulatedSensor):
         exact = (scale * RANGE / FULL)[:, None] * mixing
         self._matrix = exact.astype(np.float32)
         self._inverse = np.linalg.inv(self._matrix.astype(float)) * scale
-
-    def open(self) -> None:
-        """Open the bus."""
-        self._bus = open_bus(
-            self._settings, [{"can_id": self._base, "can_mask": 0x7F0, "extended": False}]
-        )
 
     def gauges(self) -> list[int]:
         """Return the gauges (6,), held at the ends of their range."""
@@ -68,33 +96,18 @@ class AtiNode(SimulatedSensor):
             return [bytes((self._force_code, self._torque_code))]
         return []
 
-    def serve(self) -> None:
+    def _serve_bus(self) -> None:
         """Answer questions."""
-        try:
-            while not self._ended.is_set():
-                question = self._bus.recv(0.05)
-                if question is None or self.silent:
-                    continue
-                operation = question.arbitration_id & 0xF
-                for i, data in enumerate(self.answer(operation, bytes(question.data))):
-                    self._bus.send(
-                        can.Message(
-                            arbitration_id=self._base | (operation + i), data=data,
-                            is_extended_id=False,
-                        ),
-                        timeout=0.1,
-                    )  # fmt: skip
-        except (can.CanError, OSError):
-            return  # the bus is lost
-
-    def close_wire(self) -> None:
-        """Leave the bus."""
-        if self._bus is not None:
-            close_bus(self._bus)
-            self._bus = None
+        while not self._ended.is_set():
+            question = self._bus.recv(0.05)
+            if question is None or self.silent:
+                continue
+            operation = question.arbitration_id & 0xF
+            for i, data in enumerate(self.answer(operation, bytes(question.data))):
+                self._send(self._base | (operation + i), data)
 
 
-class RobotousNode(SimulatedSensor):
+class RobotousNode(_CanNode):
     """Streams two frames a sample once it has been asked to (0x0B), until asked to stop (0x0C)."""
 
     def __init__(
@@ -106,36 +119,24 @@ class RobotousNode(SimulatedSensor):
         reply_ids: tuple[int, int] = (0x01, 0x02),
         rate: float = 200.0,
     ) -> None:
-        super().__init__(reaction)
-        self._settings, self._now = bus, clock.monotonic
-        self._command_id, self._reply_ids, self._period = command_id, reply_ids, 1.0 / rate
-        self._bus: Any = None
+        super().__init__(reaction, bus, command_id, 0x7FF)
+        self._now = clock.monotonic
+        self._reply_ids, self._period = reply_ids, 1.0 / rate
         self.streaming = False
         self.sent = 0  # samples
 
-    def open(self) -> None:
-        """Open the bus."""
-        self._bus = open_bus(
-            self._settings,
-            [{"can_id": self._command_id, "can_mask": 0x7FF, "extended": False}],
-        )
-
-    def serve(self) -> None:
+    def _serve_bus(self) -> None:
         """Obey commands and stream."""
         due = self._now()
-        try:
-            while not self._ended.is_set():
-                command = self._bus.recv(max(due - self._now(), 0.0))
-                if command is not None and len(command.data) == 8 and not self.silent:
-                    self.streaming = (self.streaming or command.data[0] == 0x0B) and (
-                        command.data[0] != 0x0C
-                    )
-                if self._now() >= due:
-                    due = max(due + self._period, self._now() - 0.1)
-                    if self.streaming and not self.silent:
-                        self._send_sample()
-        except (can.CanError, OSError):
-            return  # the bus is lost
+        while not self._ended.is_set():
+            command = self._bus.recv(max(due - self._now(), 0.0))
+            if command is not None and len(command.data) == 8 and not self.silent:
+                order = command.data[0]
+                self.streaming = (self.streaming or order == 0x0B) and order != 0x0C
+            if self._now() >= due:
+                due = max(due + self._period, self._now() - 0.1)
+                if self.streaming and not self.silent:
+                    self._send_sample()
 
     def sample(self) -> bytes:
         """Return the sixteen bytes of a sample."""
@@ -146,13 +147,5 @@ class RobotousNode(SimulatedSensor):
     def _send_sample(self) -> None:
         data = self.sample()
         for identifier, part in zip(self._reply_ids, (data[:8], data[8:]), strict=True):
-            self._bus.send(
-                can.Message(arbitration_id=identifier, data=part, is_extended_id=False), timeout=0.1
-            )
+            self._send(identifier, part)
         self.sent += 1
-
-    def close_wire(self) -> None:
-        """Leave the bus."""
-        if self._bus is not None:
-            close_bus(self._bus)
-            self._bus = None
