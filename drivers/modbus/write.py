@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
@@ -41,36 +40,16 @@ ANNOUNCE = 0.02  # s between two heartbeats while arming
 TARGET_TOLERANCE = 2.0  # counts from the target within which it is reached
 
 
-class Writer(Protocol):
-    """The writing half of a link."""
-
-    def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
-        """Prepare for writing; moves nothing. ``look`` reads a sample. Raises WriteError."""
-
-    def write(self, setpoint: Setpoint, sample: Sample, expiry: float = math.inf) -> None:
-        """Send one setpoint; ``sample`` is the one last read. Raises WriteError.
-
-        ``expiry`` (s, monotonic): no motion begins to it later.
-        """
-
-    def pending(self) -> tuple[int, list[int]] | None:
-        """Return, once, holding registers to be written with the next reading, in time."""
-
-    def release(self) -> None:
-        """End the writing so that the arm comes to rest. Raises WriteError."""
-
-    def target(self) -> Array | None:
-        """Return the joints (n,) rad sent last, None where there are none."""
-
-
 def make_writer(
     profile: ProfileFile, transport: Transport, rates: Rates, zero_timeout: float,
     clock: Clock,
-) -> Writer:  # fmt: skip
+) -> MailboxWriter | TargetWriter | ReadOnlyWriter:  # fmt: skip
     """Return the writer of a profile.
 
-    ``rates`` returns the cell's offset rates, m/s and rad/s; ``zero_timeout``: s within which the
-    robot's program must have removed an offset of a former owner.
+    Its ``arm`` moves nothing, and ``look`` reads a sample; its ``write`` gets the sample last read,
+    and begins no motion after ``expiry`` (s, monotonic). ``rates`` returns the cell's offset rates,
+    m/s and rad/s; ``zero_timeout``: s within which the robot's program must have removed an offset
+    of a former owner.
     """
     write = profile.write
     if isinstance(write, Mailbox):

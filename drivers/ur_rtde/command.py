@@ -14,7 +14,7 @@ import socket
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -43,25 +43,6 @@ INTEGERS = frozenset((
 ))  # fmt: skip
 """Calls and registers that may be used. The library's control script can run any motion and set any
 output, and RTDE inputs are anybody's: whatever these lists lack raises before the socket."""
-
-
-class Writer(Protocol):
-    """The writing half of a link."""
-
-    def arm(self, state: RobotState, look: Callable[[], None]) -> None:
-        """Prepare for writing; moves nothing. ``look`` reads a sample. Raises WriteError."""
-
-    def keep_alive(self) -> None:
-        """Feed the robot's watchdog, which may block. Raises WriteError."""
-
-    def write(self, setpoint: Setpoint, state: RobotState) -> None:
-        """Send one setpoint; ``state`` is the sample last read. Raises WriteError."""
-
-    def release(self) -> None:
-        """End the stream so that the arm comes to rest. Raises WriteError."""
-
-    def abandon(self) -> None:
-        """Drop the library's objects of a link that may be dead, without calling them."""
 
 
 _ABANDONED: list[Any] = []

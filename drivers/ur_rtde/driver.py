@@ -16,7 +16,7 @@ from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.controller_facts import TCP_TURNED, ControllerFacts, Difference, differences
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.offset_inverse import Nominal
-from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
+from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter
 from gapbridge.drivers.ur_rtde.enquiry import RoundTrip, enquire
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 from gapbridge.drivers.ur_rtde.state import StateReader
@@ -36,7 +36,7 @@ class UrRtdeDriver(Driver):
         self.settings = settings
         self.reader = StateReader(settings, clock)
         self._model, self._nominal = model, Nominal(model)
-        self._writer: Writer = (
+        self._writer: ServoWriter | OffsetWriter = (
             ServoWriter(settings, clock)
             if settings.mode == "servoj"
             else OffsetWriter(settings, self._offset_rates, clock)

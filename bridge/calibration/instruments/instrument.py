@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from gapbridge.bridge.cell.settings.instruments import Base
 from gapbridge.core.arrays import Array
@@ -13,12 +14,9 @@ from gapbridge.core.calibration.plan import Payload
 S = TypeVar("S", bound=Base)
 
 
-class Ask(Protocol):
-    """Asks the operator for one line; a command of the session raises SessionCommand."""
-
-    def __call__(self, question: str) -> str:
-        """Return what was typed, stripped."""
-        ...
+Ask = Callable[[str], str]
+"""Asks the operator a question and returns what was typed, stripped; a command of the session
+raises SessionCommand."""
 
 
 @dataclass(frozen=True)

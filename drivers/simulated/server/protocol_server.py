@@ -10,7 +10,7 @@ import select
 import socket
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.clock import Clock
@@ -18,19 +18,14 @@ from gapbridge.drivers.simulated.server.arm_controller import ArmController
 from gapbridge.drivers.simulated.server.bench import BenchServer, Command
 from gapbridge.drivers.simulated.server.connection import Connection, listen
 
+if TYPE_CHECKING:
+    from _typeshed import HasFileno
+
 SET_TIMER_SLACK = 29  # prctl's PR_SET_TIMERSLACK
 SLACK = 1000  # ns; Linux otherwise ends timeouts up to 50 us late
 PRIORITY = 40  # SCHED_FIFO, of 1 to 99; about 7 % of one core is used
 LATE = 0.1  # s: behind by more than this, the missed cycles are left out
 COLLECT_EVERY = 2.0  # s
-
-
-class Waitable(Protocol):
-    """Anything that select() can wait for."""
-
-    def fileno(self) -> int:
-        """Return the descriptor."""
-        ...
 
 
 class ProtocolServer:
@@ -44,11 +39,11 @@ class ProtocolServer:
     def cycle(self, controller: ArmController) -> None:
         """Read what clients have sent, command the arm, publish its state; after each cycle."""
 
-    def sockets(self) -> Iterable[Waitable]:
+    def sockets(self) -> Iterable[HasFileno]:
         """Return the sockets to wait for between cycles; none if ``cycle`` polls."""
         return ()
 
-    def serve(self, ready: Waitable, controller: ArmController) -> None:
+    def serve(self, ready: HasFileno, controller: ArmController) -> None:
         """Serve one of ``sockets()`` that is readable."""
 
     def commands(self, controller: ArmController) -> Mapping[str, Command]:
