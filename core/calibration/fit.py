@@ -62,7 +62,7 @@ def fit_session(
     metrology: Metrology | None = None,
     *,
     observable: Observable | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda text: None,
 ) -> SessionFit:
     """Return the fit of a session's readings, those held out not used.
 
@@ -77,7 +77,7 @@ def fit_session(
     to_fit = np.flatnonzero(~readings.held_out)
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
         problem, state = converged_fit(
-            parameters, observable, readings[to_fit], metrology, progress or _no_progress
+            parameters, observable, readings[to_fit], metrology, progress
         )
         missing = missing_effects(problem, state)
     return SessionFit(parameters, observable, metrology, readings, problem, state, notes, missing)
@@ -90,25 +90,24 @@ def evaluate_fit(
     declined: tuple[str, ...] = (),
     expected: Expectation | None = None,
     diagnose: bool = True,
-    progress: Progress | None = None,
+    progress: Progress = lambda text: None,
 ) -> Calibration:
     """Return the calibration, with the errors of the held-out readings: call it once per session.
 
     ``model`` is the cell's model; ``declined`` are further effects that were fitted and not
     supported by the data.
     """
-    report = progress or _no_progress
     parameters, readings = fit.parameters, fit.readings
     problem, state, observable = fit.problem, fit.state, fit.observable
     to_fit = np.flatnonzero(~readings.held_out)
     missing = tuple(e for e in fit.missing if e.name not in declined)
     with threadpool_limits(1, "blas"):
-        report("checking held-out poses")
+        progress("checking held-out poses")
         calibrated = parameters.model(state.values)
         check = check_held_out(problem, state, calibrated, readings, fit.metrology)
         diagnosis = None
         if diagnose:
-            diagnosis = diagnose_residual(calibrated, readings, state, fit.metrology, report)
+            diagnosis = diagnose_residual(calibrated, readings, state, fit.metrology, progress)
     estimates = fit.estimates(expected)
     shown = np.array([e.shown for e in estimates], dtype=bool)
     errors = _errors(model, calibrated, observable, readings, state.nuisance)
@@ -137,10 +136,6 @@ def evaluate_fit(
         whole_covariance=state.covariance, missing_effects=tuple(effect.name for effect in missing),
         noise_floor=_floor(diagnosis),
     )  # fmt: skip
-
-
-def _no_progress(text: str) -> None:
-    """Report nothing."""
 
 
 def _floor(diagnosis: Diagnosis | None) -> float:

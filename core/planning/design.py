@@ -66,7 +66,7 @@ def plan(
     loads: Sequence[Payload],
     workspace: Workspace,
     design: SessionDesign,
-    progress: Progress | None = None,
+    progress: Progress = lambda text, share: None,
 ) -> Plan:
     """Return the most informative poses, loads and approaches, in the order of travel.
 
@@ -75,11 +75,7 @@ def plan(
     visible, or where the poses are too few for the parameters.
     """
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
-        return _planned(parameters, observable, loads, workspace, design, progress or _no_progress)
-
-
-def _no_progress(text: str, share: float) -> None:
-    """Report nothing."""
+        return _planned(parameters, observable, loads, workspace, design, progress)
 
 
 def _planned(

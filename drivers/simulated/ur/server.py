@@ -9,7 +9,6 @@ import socket
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from functools import partial
 
 from gapbridge.core.errors import LinkError
@@ -32,12 +31,8 @@ COLLECT_EVERY = 500  # cycles
 LATE = 0.1  # s: behind by more than this, the missed cycles are left out
 
 
-@dataclass(slots=True)
-class Listener:
-    """A port's handlers for new clients and their data."""
-
-    accept: Callable[[socket.socket], Connection]
-    handle: Callable[[Connection], None]
+Accept = Callable[[socket.socket], Connection]
+Handle = Callable[[Connection], None]
 
 
 class Server:
@@ -56,8 +51,8 @@ class Server:
         self._bench = BenchServer(
             self.controller, self.rtde.close_all, partial(move_own, self.controller)
         )
-        self._clients: dict[socket.socket, tuple[Connection, Callable[[Connection], None]]] = {}
-        self._listeners: dict[socket.socket, Listener] = {}
+        self._clients: dict[socket.socket, tuple[Connection, Handle]] = {}
+        self._listeners: dict[socket.socket, tuple[Accept, Handle]] = {}
         self._open_ports(settings)
 
     def _open_ports(self, settings: ServerSettings) -> None:
@@ -74,13 +69,8 @@ class Server:
             self.close()
             raise LinkError(f"simulated controller on {host}: {error.strerror or error}") from error
 
-    def _add(
-        self,
-        sock: socket.socket,
-        accept: Callable[[socket.socket], Connection],
-        handle: Callable[[Connection], None],
-    ) -> None:
-        self._listeners[sock] = Listener(accept, handle)
+    def _add(self, sock: socket.socket, accept: Accept, handle: Handle) -> None:
+        self._listeners[sock] = accept, handle
 
     def _greeted(self, sock: socket.socket) -> Connection:
         connection = Connection(sock)
@@ -135,7 +125,8 @@ class Server:
                 accepted, _ = sock.accept()
             except OSError:
                 return
-            self._clients[accepted] = (listener.accept(accepted), listener.handle)
+            accept, handle = listener
+            self._clients[accepted] = accept(accepted), handle
             return
         connection, handle = self._clients[sock]
         connection.flush()

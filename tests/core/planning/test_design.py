@@ -37,7 +37,7 @@ from gapbridge.core.planning.route import Visit, plan_route
 from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 
-def plan(*given, progress=None, **asked) -> Plan:
+def plan(*given, progress=lambda text, share: None, **asked) -> Plan:
     """Plan from few candidates: a test need not find the very best."""
     return design.plan(*given, design.SessionDesign(**{"stops": 150} | asked), progress)
 
