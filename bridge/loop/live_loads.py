@@ -11,7 +11,8 @@ from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.loads import Loads
 from gapbridge.core.state import RobotState
 
-MOVED = 1e-5  # rad: smallest motion that determines a joint's direction of approach
+MOVED = 1e-5  # rad: smallest commanded motion that determines a joint's direction of approach
+MEASURED_MOVED = 2e-3  # rad: the same of encoders, at rest up to a coarse count (1.5e-3) of noise
 
 
 class LiveLoads:
@@ -19,7 +20,8 @@ class LiveLoads:
 
     The controller's declared payload replaces the model's, because the controller subtracts it from
     its TCP force. If a load is beyond ``bounds``, none of that state's is used: the last ones are
-    held, and ``problem`` says why.
+    held, and ``problem`` says why. Motion is that of commanded joints without our offset: encoders
+    count only where nothing else is known, since their noise would reverse an arm at rest.
     """
 
     def __init__(
@@ -35,16 +37,28 @@ class LiveLoads:
         self._cog = np.zeros((1, 3))
         self._temperature = np.zeros((1, n))
         self._approach = np.zeros((1, n))
-        self._q_at_motion: Array | None = None
+        self._q_at_motion = np.zeros(n)
+        self._followed = ""  # which joints the last motion was of
         self._last = -math.inf  # s, controller clock
 
-    def update(self, state: RobotState) -> Loads:
-        """Return the loads (one row) of this state; the arrays are reused by the next call."""
+    def update(
+        self, state: RobotState, own_q: Array | None = None, sent_q: Array | None = None
+    ) -> Loads:
+        """Return the loads (one row) of this state; the arrays are reused by the next call.
+
+        ``own_q`` (n,) rad: the robot's own target joints; None: unknown. ``sent_q`` (n,) rad: the
+        nominal joints of the last setpoint; None: nothing is being written.
+        """
         self.problem = self._problem(state)
         if self.problem is None:
             self._filter_force(state)
             self._take_payload(state)
-        self._follow_motion(state.actual_q)
+        if sent_q is not None:
+            self._follow_motion(sent_q, "sent", MOVED)
+        elif own_q is None or (own_q == state.actual_q).all():  # a link without targets
+            self._follow_motion(state.actual_q, "measured", MEASURED_MOVED)
+        else:
+            self._follow_motion(own_q, "own", MOVED)
         has_payload = self._has_payload
         if state.joint_temperatures is not None:
             self._temperature[0] = state.joint_temperatures
@@ -95,13 +109,17 @@ class LiveLoads:
         share = 1.0 - math.exp(-gap / self._constant)
         self._wrench[0] += share * (state.actual_TCP_force - self._wrench[0])
 
-    def _follow_motion(self, q: Array) -> None:
+    def _follow_motion(self, q: Array, which: str, least: float) -> None:
+        """Store the signs of motions of at least ``least`` rad; from other joints on, begin anew.
+
+        Those differ by our offset or by what the servos are behind, which is no motion.
+        """
         before = self._q_at_motion
-        if before is None:
-            self._q_at_motion = q.copy()
+        if which != self._followed:
+            self._followed, before[:] = which, q
             return
         step = q - before
-        moved = np.abs(step) > MOVED
+        moved = np.abs(step) > least
         if moved.any():
             self._approach[0, moved] = np.sign(step[moved])
             before[moved] = q[moved]

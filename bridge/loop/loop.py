@@ -98,6 +98,7 @@ class Loop:
             LoadBounds.of(model),
         )  # fmt: skip
         self._last_loads = Loads()  # of the last cycle
+        self._sent_q: Array | None = None  # nominal joints of the last setpoint, while writing
         self._model_check = ModelCheck(model, settings.setpoints.use_force)
         self._clock = ControllerClock(driver.rate, clock, hold_time(driver.rate))
         reports = Reports(memory, emit)
@@ -308,7 +309,7 @@ class Loop:
         supervisor, writing = self._supervisor, self._writing
         if writing.ready and not (supervisor.state.writes or supervisor.state == State.ARMED):
             self._release()  # a fault, or disarmed before the first setpoint
-        loads = self._last_loads = self._loads.update(state)
+        loads = self._last_loads = self._loads.update(state, nominal_q, self._sent_q)
         self._checks.check_loads(self._loads.problem)
         self._checks.check_settings(state, self._driver)
         start = self._now()
@@ -358,6 +359,10 @@ class Loop:
         """Publish a cycle: ``setpoint`` was computed for writing, and was ``sent`` or not."""
         memory, stream = self._memory, self._stream
         state, missed, nominal_q, loads, flags = cycle_input
+        if setpoint is not None:
+            self._sent_q = setpoint.nominal_q.copy()
+        elif not attempted:
+            self._sent_q = None
         if setpoint is None:
             correction = stream.correct(nominal_q, loads)
             wanted, corrected, offset = nominal_q, correction.q, correction.offset_in_base
@@ -403,8 +408,14 @@ class ModelCheck:
         self._known: bool | None = None
 
     def corrects(self, loads: Loads) -> bool:
-        """Return whether a pose has an offset under these loads (one row) or a test force."""
+        """Return whether a pose has an offset under these loads (one row) or a test force.
+
+        Joints count as moved: those with play have an offset after their first motion.
+        """
         if self._known is None:
+            if loads.approach is not None:
+                moved = np.where(loads.approach == 0.0, 1.0, loads.approach)
+                loads = replace(loads, approach=moved)
             self._known = any(self._has_offset(q, loads) for q in self._poses)
         return self._known
 

@@ -63,7 +63,7 @@ class ReplayedLoop(Loop):
         self._memory.note_state_read()
         if cycle.flags & RESYNC:
             self._loads.reset()
-        loads = self._loads.update(state)
+        loads = self._loads.update(state, cycle.own_q, self._sent_q)
         self._follow(State(cycle.state))
         setpoint = self._write_again(cycle, state, loads)
         sent = cycle.written and setpoint is not None
@@ -83,6 +83,7 @@ class ReplayedLoop(Loop):
             self._model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter,
             LoadBounds.of(self._model),
         )  # fmt: skip
+        self._sent_q = None
         self._clock.skip()
         self._streaming = False
 

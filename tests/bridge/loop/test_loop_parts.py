@@ -89,19 +89,51 @@ def test_a_force_that_does_not_count_is_not_rejected() -> None:
     assert loads.problem is None
 
 
-def test_approach_is_the_last_motion_and_noise_is_none() -> None:
+def test_approach_is_the_last_motion_and_noise_of_encoders_is_none() -> None:
+    """Of a link without targets: a count of coarse encoders is 1.5 mrad."""
     loads = LiveLoads(3, True, 0.0)
-    way = np.array([1e-4, -1e-4, 0.0])
-    noise = np.random.default_rng(0).normal(0, 1e-6, (200, 3))
+    way = np.array([5e-4, -5e-4, 0.0])
+    noise = 1.5e-3 * np.random.default_rng(0).integers(0, 2, (200, 3))
+
+    def seen(at: float, q: np.ndarray) -> np.ndarray:
+        found = loads.update(state(at, q=q), q.copy()).approach
+        assert found is not None
+        return found[0].copy()
+
     for k in range(200):
-        found = loads.update(state(0.002 * k, q=Q + noise[k]))
-    assert found.approach == pytest.approx(np.zeros((1, 3)))
+        assert not seen(0.002 * k, Q + noise[k]).any()
     for k in range(200):
-        found = loads.update(state(1 + 0.002 * k, q=Q + k * way))
-    assert found.approach == pytest.approx(np.array([[1, -1, 0]]))
+        found = seen(1 + 0.002 * k, Q + k * way)
+    assert found == pytest.approx([1, -1, 0])
     for k in range(200):
-        found = loads.update(state(2 + 0.002 * k, q=Q + 200 * way + noise[k]))
-    assert found.approach == pytest.approx(np.array([[1, -1, 0]]))
+        assert seen(2 + 0.002 * k, Q + 200 * way + noise[k]) == pytest.approx([1, -1, 0])
+    for k in range(10):
+        found = seen(3 + 0.002 * k, Q + (200 - k) * way)
+    assert found == pytest.approx([-1, 1, 0])
+
+
+@pytest.mark.parametrize("writing", [False, True])
+def test_a_commanded_reversal_counts_at_once_and_noise_of_the_encoders_never(writing: bool) -> None:
+    loads, speed = LiveLoads(3, True, 0.0), np.array([0.02, -0.02, 0.0])
+    noise = np.random.default_rng(1).normal(0, 2.5e-5, (400, 3))
+    given = np.concatenate([np.arange(100), np.full(100, 99), np.arange(99, 0, -1), np.zeros(100)])
+    signs = []
+    for k, way in enumerate(given):
+        q, read = Q + 0.002 * way * speed, state(0.002 * k, q=Q + noise[k % 400])
+        found = loads.update(read, Q, q) if writing else loads.update(read, q)
+        signs.append(found.approach[0].copy())  # type: ignore[index]
+    assert np.array(signs[1:200]) == pytest.approx(np.tile([1, -1, 0], (199, 1)))
+    assert np.array(signs[201:]) == pytest.approx(np.tile([-1, 1, 0], (len(signs) - 201, 1)))
+
+
+def test_our_offset_in_the_robots_target_is_no_motion() -> None:
+    """Between the robot's own target and the nominal joints of setpoints lies that offset."""
+    loads, offset = LiveLoads(3, True, 0.0), np.array([1e-3, -1e-3, 1e-3])
+    for k, (own, sent) in enumerate(
+        [(Q, None), (Q + offset, Q), (Q + offset, Q), (Q + offset, None)]
+    ):
+        found = loads.update(state(0.002 * k, q=Q + 5e-5 * k), own, sent)
+        assert not found.approach.any()  # type: ignore[union-attr]
 
 
 def test_temperatures_are_passed_on() -> None:
