@@ -51,8 +51,8 @@ class LiveLoads:
         """
         self.problem = self._problem(state)
         if self.problem is None:
-            self._filter_force(state)
             self._take_payload(state)
+            self._filter_force(state)
         if sent_q is not None:
             self._follow_motion(sent_q, "sent", MOVED)
         elif own_q is None or (own_q == state.actual_q).all():  # a link without targets
@@ -83,11 +83,18 @@ class LiveLoads:
         return problem
 
     def _take_payload(self, state: RobotState) -> None:
-        """Store the declared payload, if there is one."""
+        """Store the declared payload, if there is one; a change restarts the force filter.
+
+        From then on the controller subtracts another weight, which the filtered force still holds:
+        for the filter's time the model would bend under both, or under neither.
+        """
+        before = self._has_payload, self._mass[0], *self._cog[0].tolist()
         self._has_payload = state.payload is not None and state.payload_cog is not None
         if self._has_payload:
             self._mass[0] = state.payload
             self._cog[0] = state.payload_cog
+        if before != (self._has_payload, self._mass[0], *self._cog[0].tolist()):
+            self.reset()
 
     def reset(self) -> None:
         """Restart the force filter after a gap."""

@@ -89,6 +89,32 @@ def test_a_force_that_does_not_count_is_not_rejected() -> None:
     assert loads.problem is None
 
 
+@pytest.mark.parametrize("ways", [1, -1])
+def test_a_weight_that_the_controller_subtracts_from_now_on_is_out_of_the_force_at_once(
+    ways: int,
+) -> None:
+    """Else the model bends under the load twice, or not at all, until the filter has followed."""
+    loads, mass, cog = LiveLoads(3, True, 0.05), 8.0, np.array([0, 0, 0.1])
+    pull = np.array([0.0, 0, -9.81 * mass, 0, 0, 0])
+    for k in range(200):
+        declared = (k >= 100) == (ways > 0)
+        found = loads.update(
+            state(
+                1 + 0.002 * k,
+                actual_TCP_force=0.0 * pull if declared else pull,
+                payload=mass if declared else 0.0,
+                payload_cog=cog if declared else 0.0 * cog,
+            )
+        )
+        assert found.wrench is not None and found.payload_mass is not None
+        weight = 9.81 * float(found.payload_mass[0])
+        assert weight - found.wrench[0, 2] == pytest.approx(9.81 * mass)
+    payload = {"payload": found.payload_mass[0], "payload_cog": found.payload_cog[0].copy()}  # type: ignore[index]
+    after = loads.update(state(1.45, actual_TCP_force=2 * pull, **payload)).wrench
+    assert after is not None
+    assert after[0, 2] > 1.7 * pull[2]  # a force without a change of the payload is filtered
+
+
 def test_approach_is_the_last_motion_and_noise_of_encoders_is_none() -> None:
     """Of a link without targets: a count of coarse encoders is 1.5 mrad."""
     loads = LiveLoads(3, True, 0.0)
