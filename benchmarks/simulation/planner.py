@@ -48,7 +48,7 @@ class PlannedSource(Source):
 
     def attach(self, planner: Planner, clock: SimulatedClock) -> None:
         """Take what the planner sends from now on."""
-        self._interpolator = SetpointInterpolator(self.settings.timeout, "line", clock)
+        self._interpolator = SetpointInterpolator(self.settings.timeout, "line", self.rate, clock)
         planner.take = self._take
 
     def _take(self, q: Vector) -> None:

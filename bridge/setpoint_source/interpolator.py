@@ -10,29 +10,34 @@ from gapbridge.core.arrays import Array
 from gapbridge.drivers.clock import Clock
 
 MAX_INTERVAL = 0.1  # s: longest time over which one setpoint is approached
+SHORTENED = 0.5  # s per s by which that time shrinks: catching up, the arm is twice as fast at most
 
 
 class SetpointInterpolator:
     """Moves linearly to the newest setpoint over the time between the last two.
 
-    Without a new setpoint for ``timeout`` s the source is dry. ``expected``: what should have come,
-    for messages.
+    After a late one, which the next follows sooner, that time shrinks only slowly: else the way of
+    two would be asked for in what is left of their time. Without a new setpoint for ``timeout`` s
+    the source is dry. ``expected``: what should have come, for messages. ``rate``: of the cycles in
+    which it is sampled, Hz.
     """
 
-    def __init__(self, timeout: float, expected: str, clock: Clock) -> None:
+    def __init__(self, timeout: float, expected: str, rate: float, clock: Clock) -> None:
         self._now = clock.monotonic
-        self._timeout, self._expected = timeout, expected
+        self._timeout, self._expected, self._cycle = timeout, expected, 1.0 / rate
         self._newest: Array | None = None
         self._last_received = 0.0  # s, monotonic
         self._from: Array | None = None
         self._length = 0.0  # s
         self._present: Array | None = None
+        self._begun = self._sampled = 0.0  # s, monotonic: of the segment, of the present setpoint
 
     def take(self, q: Array) -> None:
         """Store a new setpoint (n,), rad."""
         now = self._now()
         interval = min(now - self._last_received, MAX_INTERVAL)
-        self._length = interval if self._newest is not None else 0.0
+        shortened = self._length - SHORTENED * interval
+        self._length = max(interval, shortened) if self._newest is not None else 0.0
         self._newest, self._last_received = q, now
 
     def first(self) -> Array | None:
@@ -47,22 +52,29 @@ class SetpointInterpolator:
 
     def begin(self, robot_q: Array) -> None:
         """Start at the arm's joints ``robot_q`` (n,) rad."""
-        self._present = robot_q.copy()
+        self._present, self._sampled = robot_q.copy(), self._now()
         self.restart()
 
     def restart(self) -> None:
-        """Start a new segment from the present to the newest setpoint."""
+        """Start a new segment from the present to the newest setpoint.
+
+        It begins when the present one was sampled, a cycle ago: else the arm would stand for a
+        cycle at each setpoint, and all the time where one comes in each cycle.
+        """
         self._from = self._present if self._present is not None else self._newest
+        self._begun = max(self._sampled, self._last_received - self._cycle)
 
     def sample(self) -> Array:
         """Return the present setpoint (n,) rad. Raises SourceDryError after the timeout."""
-        silent = self._now() - self._last_received
+        now = self._now()
+        silent = now - self._last_received
         if self._newest is None or silent > self._timeout:
             raise SourceDryError(f"setpoints: found no {self._expected} for {silent:.3f} s")
-        share = min(silent / self._length, 1.0) if self._length > 0.0 else 1.0
-        if share >= 1.0 or self._from is None:
+        self._sampled, left = now, self._length - silent
+        if left <= 0.0 or self._from is None:
             self._present = self._newest
         else:
+            share = (now - self._begun) / (now - self._begun + left)
             self._present = self._from + share * (self._newest - self._from)
         return self._present
 
@@ -76,7 +88,7 @@ class InterpolatedSource(Source):
         super().__init__(context)
         self._clock = context.clock
         self._interpolator = SetpointInterpolator(
-            self.settings.timeout, self.expected, context.clock
+            self.settings.timeout, self.expected, context.rate, context.clock
         )
 
     @abstractmethod
