@@ -309,6 +309,8 @@ class Loop:
         supervisor, writing = self._supervisor, self._writing
         if writing.ready and not (supervisor.state.writes or supervisor.state == State.ARMED):
             self._release()  # a fault, or disarmed before the first setpoint
+        if not (writing.ready or supervisor.state.writes):
+            self._in_force.follow(nominal_q)
         loads = self._last_loads = self._loads.update(state, nominal_q, self._sent_q)
         self._checks.check_loads(self._loads.problem)
         self._checks.check_settings(state, self._driver)

@@ -21,6 +21,7 @@ from gapbridge.drivers.controller_address import address_of
 from gapbridge.drivers.link_settings import DriverSettings
 
 MOVED_AWAY = 0.02  # rad: an arm farther from its last setpoint has been moved meanwhile
+RETURNED = 1e-6  # rad: an arm this near to the nominal joints was moved there, without the offset
 
 
 class InForce(NamedTuple):
@@ -55,6 +56,7 @@ class OffsetInForce:
         self._which = numbers[:1]  # 0: none; 1, 2: the valid record
         self._places = numbers[1:].reshape(2, size)
         self._before = float(self._which[0])
+        self._arrived = False  # the arm was seen near the last setpoint
 
     @classmethod
     def of_link(cls, n: int, link: DriverSettings) -> Self:
@@ -69,20 +71,40 @@ class OffsetInForce:
         row[:n], row[n : 2 * n], row[2 * n :] = q, delta, offset_in_base
         self._before = float(self._which[0])
         self._which[0] = place + 1.0
+        self._arrived = False
 
     def take_back(self) -> None:
         """Return to what was stored before the last ``note``: it never took effect."""
         self._which[0] = self._before
 
+    def follow(self, q: Array) -> None:
+        """Forget the offset once an arm that nobody writes to leaves its last setpoint; q (n,) rad.
+
+        An arm that comes back has been moved there without it. One that has not arrived yet, as
+        drives may go on to their last setpoint, is not leaving.
+        """
+        if self._which[0] not in (1.0, 2.0):
+            return
+        near = bool((np.abs(self._record()[: self._n] - q) <= MOVED_AWAY).all())
+        if self._arrived and not near:
+            self._which[0] = self._before = 0.0
+        self._arrived = near
+
     def offset_at(self, q: Array) -> InForce | None:
         """Return the offset that an arm at q (n,) rad still has; None: none, or it was moved."""
         if self._which[0] not in (1.0, 2.0):
             return None
-        row, n = self._places[int(self._which[0]) - 1], self._n
-        stayed = bool((np.abs(row[:n] - q) <= MOVED_AWAY).all()) and bool(np.isfinite(row).all())
-        if not stayed or not row[n : 2 * n].any():
+        row, n = self._record(), self._n
+        last, delta = row[:n], row[n : 2 * n]
+        stayed = bool((np.abs(last - q) <= MOVED_AWAY).all()) and bool(np.isfinite(row).all())
+        if not stayed or (np.abs(last - delta - q) <= RETURNED).all():
             return None
-        return InForce(row[n : 2 * n].copy(), row[2 * n :].copy())
+        return InForce(delta.copy(), row[2 * n :].copy())
+
+    def _record(self) -> Array:
+        """Return the valid record: last setpoint (n,), its joint offset (n,), TCP offset (6,)."""
+        record: Array = self._places[int(self._which[0]) - 1]
+        return record
 
 
 def _mapped(path: Path, size: int) -> mmap.mmap:

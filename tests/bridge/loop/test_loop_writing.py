@@ -319,7 +319,8 @@ def test_a_stream_goes_on_from_what_is_in_force(
     bench.stream.limiter._block[2] = rate = 1e-4  # m/s: the limiter's, less than the ramp wants
     bench.cycles(20)
     in_force = bench.stream.limiter.offset_in_base
-    stored = bench.writing._in_force.offset_at(bench.driver.sent[-1])
+    here = bench.driver.sent[-1]
+    stored = bench.writing._in_force.offset_at(here)
     never_in_force(bench)
     moved = bench.stream.limiter.offset_in_base - in_force
     assert np.linalg.norm(moved[:3]) > 0.5 * rate * T
@@ -332,7 +333,7 @@ def test_a_stream_goes_on_from_what_is_in_force(
     assert 4.9 * rate * T < step <= 5.0 * rate * T * (1.0 + 1e-9)
     assert stored is not None
     bench.writing._in_force.take_back()
-    before = bench.writing._in_force.offset_at(Q)
+    before = bench.writing._in_force.offset_at(here)
     assert before is not None and (before.delta == stored.delta).all()
 
 
@@ -349,12 +350,13 @@ def test_what_has_lapsed_is_taken_back_once(bench: Bench) -> None:
 
 def test_an_offset_that_never_took_effect_is_not_kept_for_the_next_start(bench: Bench) -> None:
     bench.cycles(20)
-    stored = bench.writing._in_force.offset_at(Q)
+    here = bench.driver.sent[-1]
+    stored = bench.writing._in_force.offset_at(here)
     _lapses(bench)
-    noted = bench.writing._in_force.offset_at(Q)
+    noted = bench.writing._in_force.offset_at(here)
     bench.driver.error = GateError("gate: refused")
     bench.cycles(1)
-    found = bench.writing._in_force.offset_at(Q)
+    found = bench.writing._in_force.offset_at(here)
     assert stored is not None and noted is not None and found is not None
     assert (noted.delta != stored.delta).any()
     assert (found.delta == stored.delta).all()
