@@ -84,10 +84,11 @@ class NominalStream:
     """Tracks position and velocity of the nominal joints reached, so that it can brake smoothly.
 
     If a source runs dry in the middle of a motion, the joints brake along their path, the fastest
-    with DECELERATION.
+    with DECELERATION, or harder where a joint limit (``lower``, ``upper``: (n,) rad) is nearer.
     """
 
-    def __init__(self, velocity_limit: Array) -> None:
+    def __init__(self, velocity_limit: Array, lower: Array, upper: Array) -> None:
+        self._lower, self._upper = lower, upper
         # one array: each argument of compiled code costs time in every call
         self._motion = np.zeros((3, len(velocity_limit)))
         self._motion[LIMIT] = velocity_limit
@@ -109,11 +110,24 @@ class NominalStream:
         """Return the setpoint (n,) ``gap`` s later while braking; valid until the next call."""
         fastest = float(np.abs(self._rate).max())
         if fastest > 0.0:
-            speed = max(fastest - DECELERATION * gap, 0.0)
+            speed = max(fastest - self._deceleration(fastest) * gap, 0.0)
             after = self._rate * (speed / fastest)
             self.q += 0.5 * gap * (self._rate + after)
+            # the last step takes a whole cycle, and so more room than was left
+            np.clip(self.q, self._lower, self._upper, out=self.q)
             self._rate[:] = after
         return self.q
+
+    def _deceleration(self, fastest: float) -> float:
+        """Return that of the fastest joint with which each stops before its limit, rad/s^2."""
+        rate = self._rate
+        room = np.where(rate > 0.0, self._upper - self.q, self.q - self._lower)
+        moves = rate != 0.0
+        if (room[moves] <= 0.0).any():
+            return np.inf
+        return float(
+            np.max(0.5 * fastest * np.abs(rate[moves]) / room[moves], initial=DECELERATION)
+        )
 
     def keep(self) -> None:
         """Remember the present motion for ``take_back``."""
@@ -137,7 +151,7 @@ class SetpointStream:
         limits = limits_of(settings, model.arm, rate)
         self.limiter = Limiter(limits, model.arm.n)
         self._compensator = Compensator(model)
-        self._nominal = NominalStream(limits.velocity)
+        self._nominal = NominalStream(limits.velocity, limits.lower, limits.upper)
         self._ramp_time = settings.ramp_time
         self._longest_gap = MAX_GAP_CYCLES / rate
         self._ramp = 0.0

@@ -51,7 +51,7 @@ def _setpoints() -> None:
     corrected = Compensator(model).correct(Q[0])
     Gate(500.0, model, True, lambda: 0.0)
     Nominal(model)
-    NominalStream(np.ones(N))
+    NominalStream(np.ones(N), -np.ones(N), np.ones(N))
     limits = Limits(np.full(N, -7.0), np.full(N, 7.0), np.full(N, 3.0))
     limiter = Limiter(limits, N)
     limiter.start(Q[0])

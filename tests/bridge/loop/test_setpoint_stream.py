@@ -39,11 +39,11 @@ def state(at: float, q: np.ndarray = Q) -> RobotState:
 class Run:
     """Drives a stream as the loop does, with an arm that follows at once."""
 
-    def __init__(self, soft: float = 5e-6, **limits: float) -> None:
+    def __init__(self, soft: float = 5e-6, start: np.ndarray = Q, **limits: float) -> None:
         self.stream = SetpointStream(model(soft), LimitSettings(**limits), 500.0, clock=SYSTEM)
-        self.at, self.q = 100.0, Q.copy()
+        self.at, self.q, self.start = 100.0, start.copy(), start
         self.sent: list[Setpoint] = []
-        self.stream.start(Q, self.at)
+        self.stream.start(start, self.at)
 
     def cycles(
         self, count: int, source: np.ndarray | None = Q, goal: float = 1.0, gap: float = CYCLE
@@ -57,7 +57,7 @@ class Run:
         return self.sent[-1]
 
     def steps(self) -> np.ndarray:
-        return np.diff([Q, *(s.q for s in self.sent)], axis=0)
+        return np.diff([self.start, *(s.q for s in self.sent)], axis=0)
 
 
 def test_the_offset_ramps_in_to_the_whole_correction_and_out_to_none() -> None:
@@ -206,7 +206,7 @@ def test_limits_come_from_the_arm_and_the_cell() -> None:
 
 def test_braking_keeps_the_direction_and_ends_after_the_right_way() -> None:
     speed = np.array([1.0, -0.5])
-    stream = NominalStream(np.full(2, 3.0))
+    stream = NominalStream(np.full(2, 3.0), np.full(2, -3.0), np.full(2, 3.0))
     stream.start(np.zeros(2))
     for k in range(1, 200):
         stream.follow(speed * k * CYCLE, CYCLE)
@@ -217,6 +217,30 @@ def test_braking_keeps_the_direction_and_ends_after_the_right_way() -> None:
     assert way[0] == pytest.approx(1.0 / (2 * DECELERATION), rel=0.03)
     assert way[1] == pytest.approx(-0.5 * way[0], rel=1e-6)
     assert stream.brake(CYCLE) == pytest.approx(stream.q)
+
+
+@pytest.mark.parametrize("room", [0.3, 0.1, 0.05, 0.02, 0.004])
+@pytest.mark.parametrize("ways", [1.0, -1.0])
+def test_a_motion_that_ends_before_a_joint_limit_brakes_hard_enough_to_stop_there(
+    room: float, ways: float
+) -> None:
+    speed = 1.6 * ways * np.array([0.2, 0.0, 1.0, 0.0, -0.1, 0.0])  # joint 3 towards its limit
+    limits = builtin_arm("ur10e").limits
+    limit = limits.upper[2] if ways > 0.0 else limits.lower[2]
+    q = Q.copy()
+    q[2] = limit - ways * room - 1.2 * speed[2]
+    run = Run(soft=1e-9, start=q)
+    run.cycles(300, source=q)
+    for k in range(1, 601):
+        run.cycles(1, source=q + speed * CYCLE * k)
+    assert ways * (limit - run.q[2]) == pytest.approx(room, abs=1e-6)
+    run.cycles(1000, source=None, goal=0.0)
+    assert run.stream.at_rest
+    assert ways * (limit - run.q[2]) >= 0.0
+    steps = np.diff([s.nominal_q for s in run.sent[899:]], axis=0) / CYCLE
+    assert (np.abs(steps) <= np.abs(speed) * (1.0 + 1e-6) + 1e-9).all()
+    harder = max(DECELERATION, speed[2] ** 2 / (2.0 * room))
+    assert np.abs(np.diff(steps[:, 2])).max() <= 1.2 * harder * CYCLE
 
 
 FAST = np.array([0.35, 0.0, 0.0, 0.0, 0.0, 0.0])  # rad/s
