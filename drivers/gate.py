@@ -109,6 +109,7 @@ def _judge_joints(links, joints, numbers, first):  # type: ignore[no-untyped-def
     for i in range(n):
         lag = abs(last[i] - nominal[i])
         nearer = nearer and abs(q[i] - nominal[i]) <= lag + ROUNDING
+        lag = max(lag, abs(last[i] - joints[6, i]))
         if abs(q[i] - nominal[i]) > max(numbers[4], lag) + ROUNDING:
             return JOINT_OFFSET, i, abs(q[i] - nominal[i]), 0.0
         if not first:  # before the first setpoint the arm may have sagged
@@ -116,10 +117,14 @@ def _judge_joints(links, joints, numbers, first):  # type: ignore[no-untyped-def
     if not nearer and (
         length > numbers[0] * SECOND_ORDER + ROUNDING or turn > numbers[1] * SECOND_ORDER + ROUNDING
     ):
-        # a command that lags by the joints' velocity limits may be far from its goal, but it must
-        # not move away from it
+        # a command that lags by the joints' velocity limits may be far from its goal, or have an
+        # offset left from a wider envelope, but it must not move away: it is no farther from its
+        # goal than the last command is from this goal, or was from its own
         _place(links, last, was, scratch)
         far, turned = _gap(was, there)
+        _place(links, joints[6], there, scratch)
+        before, turned_before = _gap(was, there)
+        far, turned = max(far, before), max(turned, turned_before)
         if length > max(numbers[0] * SECOND_ORDER, far) + ROUNDING:
             return LONG_OFFSET, -1, length, 0.0
         if turn > max(numbers[1] * SECOND_ORDER, turned) + ROUNDING:
@@ -147,9 +152,9 @@ def _judge_offsets(offsets, numbers, length, turn):  # type: ignore[no-untyped-d
 def _judge(links, joints, offsets, numbers, budget, moves, first):  # type: ignore[no-untyped-def]
     """Return (reason, joint, value found, time (s) that the step takes at the limiting rates).
 
-    joints (6, n): q, nominal, last q, lower, upper, velocity. offsets (2, 6): this, last. numbers:
-    envelope, its rotation, its rates, joint offset, longest step (s). first: nothing was sent yet,
-    and last q is the arm's position when it was armed.
+    joints (7, n): q, nominal, last q, lower, upper, velocity, last nominal. offsets (2, 6): this,
+    last. numbers: envelope, its rotation, its rates, joint offset, longest step (s). first: nothing
+    was sent yet, and last q is the arm's position when it was armed.
     """
     n, q, nominal = joints.shape[1], joints[0], joints[1]
     for i in range(n):
@@ -198,7 +203,7 @@ class Gate:
         self._arm_velocity = np.where(
             np.isfinite(arm.limits.velocity), arm.limits.velocity, DEFAULT_VELOCITY
         )
-        self._joints = np.zeros((6, n))
+        self._joints = np.zeros((7, n))
         self._joints[3], self._joints[4] = arm.limits.lower, arm.limits.upper
         self._offsets, self._numbers = np.zeros((2, 6)), np.zeros(6)
         self._moves_arm = moves_arm
@@ -274,13 +279,15 @@ class Gate:
         if self._moves_arm and not (away <= START).all():  # NaN is not
             raise GateError(self._reason(FAR_START, int(np.argmax(away)), float(away.max())))
         self._joints[2] = start_q
+        self._joints[6] = start_q  # where it stands it has no offset yet
 
-    def _state(self) -> tuple[Array, Array, tuple[Array, Array] | None]:
-        return self._joints[2].copy(), self._offsets[1].copy(), self._started
+    def _state(self) -> tuple[Array, Array, Array, tuple[Array, Array] | None]:
+        joints = self._joints
+        return joints[2].copy(), joints[6].copy(), self._offsets[1].copy(), self._started
 
     def take_back(self) -> None:
         """Judge from the setpoint before the one sent last, which never took effect."""
-        self._joints[2], self._offsets[1], self._started = self._before
+        self._joints[2], self._joints[6], self._offsets[1], self._started = self._before
 
     def sent(self) -> None:
         """Record that the setpoint checked last was sent."""
@@ -288,7 +295,8 @@ class Gate:
         now = self._clock()
         self._budget = min(self._budget + CLOCK_RATIO * max(now - self._at, 0.0), self._most)
         self._budget, self._at, self._travel = self._budget - self._travel, now, 0.0
-        self._joints[2], self._offsets[1] = self._joints[0], self._offsets[0]
+        self._joints[2], self._joints[6] = self._joints[0], self._joints[1]
+        self._offsets[1] = self._offsets[0]
         self._started = None
 
     def _reason(self, code: int, joint: int, value: float) -> str:

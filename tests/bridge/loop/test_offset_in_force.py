@@ -8,16 +8,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from clock_by_hand import ByHand
 from test_loop_release import RATE, Bench, Q
 
+from gapbridge.bridge.cell.sections import LimitSettings
 from gapbridge.bridge.ipc.command_memory import Command
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
-from gapbridge.bridge.loop.offset_in_force import MOVED_AWAY, OffsetInForce
+from gapbridge.bridge.loop.offset_in_force import MOVED_AWAY, InForce, OffsetInForce
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from gapbridge.bridge.setpoint_source.source import SourceContext
 from gapbridge.bridge.setpoint_source.target import TargetSource
+from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import correct
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM
+from gapbridge.drivers.gate import Gate
 
 DELTA = np.full(6, 1e-3)
 STOP, FINE, DISARM, ARM_AGAIN, LAST = 620, 700, 720, 1000, 1800  # cycles
@@ -116,3 +123,35 @@ def test_an_arm_jogged_away_and_back_to_where_it_was_taught_is_corrected_again(
     settled = bench.sent[STOP - 40], bench.sent[STOP - 20 + 700]
     assert settled[0] == pytest.approx(wanted, abs=1e-9)
     assert settled[1] == pytest.approx(wanted, abs=1e-9)
+
+
+@pytest.mark.parametrize("joint", range(4))
+@pytest.mark.parametrize("speed", [0.0, 0.1, -0.1])
+def test_an_offset_beyond_a_narrowed_envelope_comes_in_while_the_source_moves(
+    joint: int, speed: float
+) -> None:
+    """The gate passes what never grows, also where the nominal joints come towards the command."""
+    soft = Model(builtin_arm("ur10e"), payload_mass=8.0)
+    soft = soft.with_compliance(np.full(6, 5e-5), np.full(6, 1e-5))
+    home = np.array([0.3, -1.5, 1.8, -1.2, -1.57, 0.4])
+    found = correct(soft, home[None])
+    delta, offset = found.q[0] - home, found.offset_in_base[0]
+    assert np.linalg.norm(offset[:3]) > 0.006
+    limits, clock = LimitSettings(offset=0.001), ByHand()
+    stream = SetpointStream(soft, limits, RATE, clock)
+    gate = Gate(RATE, soft, True, clock.monotonic)
+    gate.set_bounds(gate_bounds(limits))
+    command = home + delta
+    stream.start(command, clock.now, in_force=InForce(delta, offset))
+    gate.begin(command)
+    source, still = command.copy(), np.zeros(6)
+    for k in range(400):
+        clock.sleep(1.0 / RATE)
+        source = source.copy()
+        source[joint] += speed * min(k / 50.0, 1.0) / RATE
+        state = RobotState(clock.now, clock.now, command, still, command, still)
+        setpoint = stream.advance(state, source, Loads(), 1.0)
+        gate.check(setpoint)
+        gate.sent()
+        command = setpoint.q.copy()
+    assert np.linalg.norm(setpoint.offset_in_base[:3]) < 0.001 * (1.0 + 1e-9)
