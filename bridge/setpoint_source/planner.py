@@ -34,6 +34,7 @@ MOST_LINES = 8  # read in one cycle; the rest is read in the next ones
 MOST_WAITING = 4  # connections without a valid line yet
 MOST_SKIPPED = 1 << 20  # bytes dropped at once, more than a socket stores
 SPAN = 2.0  # s over which lines are counted against the robot's cycles
+CLOCK_RATIO = 1.02  # largest ratio of the controller's clock rate, a planner's clock, to this one's
 
 
 class Connection:
@@ -68,7 +69,8 @@ class Connection:
             self.refuse("a line without end")
             return []
         now = self._now()
-        self._credit = min(self._credit + (now - self._credit_time) * self._rate, SPAN * self._rate)
+        earned = CLOCK_RATIO * (now - self._credit_time) * self._rate
+        self._credit = min(self._credit + earned, SPAN * self._rate)
         self._credit -= len(lines)
         self._credit_time = now
         if self._credit < 0.0:
