@@ -9,12 +9,14 @@ import sys
 
 import numpy as np
 
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.setpoint_source.interpolator import InterpolatedSource
 from gapbridge.bridge.setpoint_source.plc_memory import MOST_JOINTS, PlcMemory
 from gapbridge.bridge.setpoint_source.source import SourceContext, SourceStatus
 from gapbridge.core.errors import InputError, RunError
 
 WRITTEN, LIMITED = 1, 2  # flags
+CHECK_INTERVAL = 0.5  # s between looks at the server's process
 
 SERVER = "gapbridge.bridge.setpoint_source.modbus_server"  # module of the server process
 
@@ -37,6 +39,8 @@ class ModbusSource(InterpolatedSource):
         self._server: subprocess.Popen[str] | None = None
         self._sequence: int | None = None
         self._cycle = 0
+        self._next_check = 0.0  # s, monotonic
+        self._ended_since: float | None = None  # s, monotonic: the server's process has ended
         self.port = 0
 
     def open(self) -> None:
@@ -86,12 +90,31 @@ class ModbusSource(InterpolatedSource):
         return True
 
     def emit(self, reported: SourceStatus) -> None:
-        """Report state, corrected and nominal joints to the PLC."""
+        """Report state, corrected and nominal joints to the PLC.
+
+        Raises RunError where its server has ended, though not while setpoints are written or an
+        armed driver may await its first one: the source runs dry before.
+        """
         if self._memory is None:
             return
+        self._check_server(State(reported.state))
         self._cycle += 1
         flags = (WRITTEN if reported.written else 0) | (LIMITED if reported.clamped else 0)
         self._memory.put_status(
             (int(reported.state), self._sequence or 0, self._cycle, flags),
             np.concatenate([reported.corrected_q, reported.nominal_q, reported.offset_in_base]),
         )
+
+    def _check_server(self, state: State) -> None:
+        """Raise RunError once the server has ended; the loop's next process starts another."""
+        now = self._clock.monotonic()
+        if now < self._next_check or self._server is None:
+            return
+        self._next_check = now + CHECK_INTERVAL
+        if self._server.poll() is None:
+            return
+        if self._ended_since is None:
+            self._ended_since = now
+        if not state.writes and now - self._ended_since > self.settings.timeout:
+            code = self._server.returncode
+            raise RunError(f"setpoints: the server for the PLC has ended (exit code {code})")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clock_by_hand import ByHand
 from daemon_cell import Robot, Run
 from patience import wait_for
 from ports import free_port
@@ -118,6 +119,33 @@ def test_a_plc_reads_state_corrected_joints_and_offset(source: ModbusSource) -> 
     assert numbers_of(found[10:16]) == pytest.approx(HERE + 0.002, abs=UNIT)
     assert numbers_of(found[30:36]) == pytest.approx(HERE, abs=UNIT)
     assert numbers_of(found[50:62]) == pytest.approx(offset, abs=UNIT)
+
+
+def test_a_server_that_has_died_ends_the_process_once_nothing_is_written() -> None:
+    """Else no PLC could connect any more, and nobody would know why."""
+    clock = ByHand()
+    settings = SetpointSettings(source="modbus", port=0, timeout=1.0)
+    source = make_source(settings, 3, True, Path(), clock=clock)
+    assert isinstance(source, ModbusSource)
+
+    def seconds(state: State, count: float) -> None:
+        for _ in range(round(100 * count)):
+            clock.sleep(0.01)
+            source.emit(SourceStatus(state, HERE, HERE, np.zeros(6), False, 0))
+
+    source.open()
+    try:
+        for state in State:
+            seconds(state, 2.0)
+        assert source._server is not None
+        source._server.kill()
+        source._server.wait()
+        seconds(State.COMPENSATING, 3.0)
+        seconds(State.HOLDING, 3.0)
+        with pytest.raises(RunError, match=r"server for the PLC has ended \(exit code -9\)"):
+            seconds(State.OBSERVING, 2.0)
+    finally:
+        source.close()
 
 
 def test_mbpoll_reads_the_status(source: ModbusSource) -> None:
