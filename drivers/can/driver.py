@@ -219,20 +219,20 @@ class CanDriver(Driver):
         reason, message = self.reader.stop_reason(writing=False)
         if reason:
             raise WriteError(f"{self.profile.name}: {reason}: {message}")
-        start = self._present()
+        start = state.actual_q  # a checked sample's; those read while enabling are not checked
+        self.writer.reset()
         try:
-            self.writer.run(self.profile.enable, self._present, self._listen, self._reached)
-            displacement = float(np.abs(self._present() - start).max())
-            if displacement > self.settings.arming_distance:
-                raise WriteError(
-                    f"{self.profile.name}: the arm moved {displacement:.3f} rad when enabled"
-                )
+            self.writer.run(
+                self.profile.enable, lambda: self._near(start), self._listen, self._reached
+            )
+            hold = self._near(start)
+            if self.writer.target is None:
+                self.writer.write(hold)
         except LinkError:
+            target = self.writer.target
             with contextlib.suppress(LinkError):
-                self._run_release(self._present)
+                self._run_release(lambda: start if target is None else target)
             raise
-        if self.writer.target is None:
-            self.writer.write(self._present())
         self._armed_at = self._changed = self._now()
         self._reset_reading()
 
@@ -240,6 +240,16 @@ class CanDriver(Driver):
         if self._q is None:
             raise WriteError(f"{self.profile.name}: found no state, expected read_state() first")
         return self._q
+
+    def _near(self, start: Array) -> Array:
+        """Return the present joints (n,), rad, to be held. Raises WriteError where they moved."""
+        present = self._present()
+        displacement = float(np.abs(present - start).max())
+        if not displacement <= self.settings.arming_distance:
+            raise WriteError(
+                f"{self.profile.name}: the arm moved {displacement:.3f} rad when enabled"
+            )
+        return present
 
     def _listen(self, seconds: float) -> None:
         """Read for ``seconds``, sending requests where needed; updates the present joints."""

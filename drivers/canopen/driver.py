@@ -219,7 +219,7 @@ class CanopenDriver(Driver):
                         f"{self.master.where}: node {node}: found {reported}"
                         f"{self.power.emergency(node)}, expected none; link.clear_faults resets it"
                     )
-            self._enable(sample)
+            self._enable(sample, state.actual_q)
         except WriteError:
             raise
         except LinkError as error:
@@ -240,19 +240,24 @@ class CanopenDriver(Driver):
             if sample is None and now - self._fresh_at > quiet + self.settings.state_timeout:
                 raise StaleStateError(f"{self.master.where}: {self.master.collector.why()}")
 
-    def _enable(self, sample: SyncSet) -> None:
-        start = positions(self.profile, sample)
-        self.writer.load()  # first: without it nothing can be sent, not even what disables
-        try:
-            self.power.prepare()
-            hold = self.power.enable(sample, self.settings.arming_time, self.settings.clear_faults)
-            assert self.sync_cycle.sample is not None
-            moved_to = positions(self.profile, self.sync_cycle.sample)
-            displacement = float(np.abs(moved_to - start).max())
-            if displacement > self.settings.arming_distance:
+    def _enable(self, sample: SyncSet, start: Array) -> None:
+        """Enable; ``start`` (n,) rad is of a checked sample, and those read meanwhile are not."""
+        settings = self.settings
+
+        def near(latest: SyncSet) -> Array:
+            present = positions(self.profile, latest)
+            displacement = float(np.abs(present - start).max())
+            if not displacement <= settings.arming_distance:
                 raise WriteError(
                     f"{self.profile.name}: the arm moved {displacement:.3f} rad when enabled"
                 )
+            return present
+
+        near(sample)
+        self.writer.load()  # first: without it nothing can be sent, not even what disables
+        try:
+            self.power.prepare()
+            hold = self.power.enable(sample, near, settings.arming_time, settings.clear_faults)
             self.writer.send([self.power.following] * self.n, hold)
         except LinkError:
             with contextlib.suppress(LinkError):

@@ -30,6 +30,7 @@ STILL_SYNCS = 3  # SYNCs without a change of any count, after which the arm is a
 OFF: tuple[State, ...] = (
     "SWITCH ON DISABLED", "READY TO SWITCH ON", "NOT READY TO SWITCH ON", "FAULT",
 )  # fmt: skip
+Near = Callable[[SyncSet], Array]  # a sample's joints (n,), rad, if the arm has not moved
 
 
 class Power:
@@ -80,26 +81,27 @@ class Power:
             self._master.write(node, MODES_OF_OPERATION, mode)
             del self._modes[node]
 
-    def enable(self, sample: SyncSet, within: float, clear_faults: bool) -> Array:
+    def enable(self, sample: SyncSet, near: Near, within: float, clear_faults: bool) -> Array:
         """Enable all drives at the present joints; returns the joints (n,) that they hold, rad.
 
-        ``sample`` is the newest sample. Raises WriteError if a drive is not enabled in time.
+        ``sample`` is the newest sample, of which ``near`` returns the joints or raises WriteError:
+        each goes out as a target. Raises WriteError too if a drive is not enabled in time.
         """
         hold: Array | None = None
         resetting = False
         end = self._now() + within
         while True:
-            reported = states(sample)
+            reported, present = states(sample), near(sample)
             enabled = all(state == "OPERATION ENABLED" for state in reported)
             if hold is None and enabled:
-                hold = positions(self._profile, sample)
+                hold = present
             if hold is not None and enabled and not_following(self._profile, sample) is None:
                 return hold
             if self._now() > end:
                 raise self._not_enabled(sample)
             resetting = not resetting and clear_faults
             commands = [self._towards(state, enabled, resetting) for state in reported]
-            self._writer.send(commands, positions(self._profile, sample) if hold is None else hold)
+            self._writer.send(commands, present if hold is None else hold)
             sample = self._exchange() or sample
 
     def _towards(self, state: State, all_enabled: bool, resetting: bool) -> int:

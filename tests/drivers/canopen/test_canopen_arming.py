@@ -1,0 +1,80 @@
+"""Arming CiA 402 drives: what is read and heard while they are being enabled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from drive_arm import DriveArm, served, settled
+
+from gapbridge.core.errors import WriteError
+from gapbridge.drivers.canopen.driver import CanopenDriver
+from gapbridge.drivers.canopen.objects import ENABLE_OPERATION
+from gapbridge.drivers.canopen.state import states
+from gapbridge.drivers.canopen.sync_set import SyncSet
+from gapbridge.drivers.simulated.canopen.machine import Phase
+
+SWITCHED_ON = {"SWITCHED ON", "OPERATION ENABLED"}
+
+
+@pytest.fixture
+def arm() -> Iterator[DriveArm]:
+    with served("cia402") as found:
+        yield found
+
+
+@pytest.fixture
+def driver(arm: DriveArm) -> Iterator[CanopenDriver]:
+    with arm.driver() as found:
+        yield found
+
+
+def phases(arm: DriveArm) -> set[Phase]:
+    return {drive.axis.machine.phase for drive in arm.server.drives}
+
+
+def read_wrong_when_switched_on(
+    monkeypatch: pytest.MonkeyPatch, driver: CanopenDriver, wrong: float, samples: int
+) -> None:
+    """Have joint 3 read off by ``wrong`` rad in the first samples of drives that are on."""
+    exchange, left = driver.power._exchange, [samples]
+
+    def exchanged() -> SyncSet | None:
+        sample = exchange()
+        if sample is None or not left[0] or not SWITCHED_ON & set(states(sample)):
+            return sample
+        left[0] -= 1
+        counts = [dict(joint) for joint in sample.counts]
+        counts[2]["Position actual value"] += int(wrong * driver.profile.counts_per_radian[2])
+        return sample._replace(counts=tuple(counts))
+
+    monkeypatch.setattr(driver.power, "_exchange", exchanged)
+
+
+@pytest.mark.parametrize("samples", [1, 20])
+def test_a_wrong_sample_while_the_drives_are_enabled_is_not_sent_as_the_target(
+    arm: DriveArm, driver: CanopenDriver, monkeypatch: pytest.MonkeyPatch, samples: int
+) -> None:
+    state, send = settled(driver), driver.writer.send
+    targets: list[np.ndarray] = []
+
+    def sent(words: list[int], q: np.ndarray, *given: float) -> None:
+        if ENABLE_OPERATION in words:
+            targets.append(q)
+        send(words, q, *given)
+
+    read_wrong_when_switched_on(monkeypatch, driver, 0.3, samples)
+    monkeypatch.setattr(driver.writer, "send", sent)
+    with pytest.raises(WriteError, match=r"the arm moved 0\.300 rad when enabled"):
+        driver.arm(state)
+    assert Phase.ENABLED not in phases(arm)
+    assert all(np.abs(q - state.actual_q).max() < 1e-3 for q in targets)
+
+
+def test_joints_that_give_a_little_when_enabled_are_armed(
+    arm: DriveArm, driver: CanopenDriver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_wrong_when_switched_on(monkeypatch, driver, 0.5 * driver.settings.arming_distance, 20)
+    driver.arm(settled(driver))
+    assert phases(arm) == {Phase.ENABLED}
