@@ -52,6 +52,7 @@ class CanDriver(Driver):
         self.writer = FrameWriter(settings, profile, clock)
         self._builder = StateBuilder(profile.n)
         self._armed_at: float | None = None  # s, monotonic
+        self._quiet_at = 0.0  # s, monotonic: when arming found no other commander
         self._returned_at = -1.0  # s, received of the sample last returned
         self._slot = 0.0  # s, monotonic: when the next request is due
         self._changed = 0.0  # s, monotonic: when the joints last changed
@@ -215,6 +216,7 @@ class CanDriver(Driver):
         foreign = self.reader.foreign
         if foreign is not None and self._now() - foreign.seen < quiet:
             raise self._commanded_by_another()
+        self._quiet_at = self._now()
         self._pending = None
         reason, message = self.reader.stop_reason(writing=False)
         if reason:
@@ -225,6 +227,7 @@ class CanDriver(Driver):
             self.writer.run(
                 self.profile.enable, lambda: self._near(start), self._listen, self._reached
             )
+            self._check_foreign()
             hold = self._near(start)
             if self.writer.target is None:
                 self.writer.write(hold)
@@ -268,6 +271,12 @@ class CanDriver(Driver):
         enabled = not self.profile.enabled_values or self.reader.enabled
         return enabled and (goal == "enabled" or not self.reader.stop_reason(writing=True)[0])
 
+    def _check_foreign(self) -> None:
+        """Raise ForeignCommandError for another commander since arming, while enabling too."""
+        foreign = self.reader.foreign
+        if foreign is not None and foreign.seen > self._quiet_at:
+            raise self._commanded_by_another()
+
     def _commanded_by_another(self) -> ForeignCommandError:
         foreign = self.reader.foreign
         assert foreign is not None
@@ -280,9 +289,7 @@ class CanDriver(Driver):
         """Send one setpoint whole; needs ``arm`` before. Raises WriteError."""
         if self._armed_at is None:
             raise WriteError(f"{self.profile.name}: found a setpoint, expected arm() first")
-        foreign = self.reader.foreign
-        if foreign is not None and foreign.seen > self._armed_at:
-            raise self._commanded_by_another()
+        self._check_foreign()
         self.writer.write(setpoint.q)
 
     def _release(self) -> None:

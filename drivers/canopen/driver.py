@@ -73,6 +73,7 @@ class CanopenDriver(Driver):
         self._fresh_at = 0.0  # s, monotonic: of the last whole sample
         self._connected_at = 0.0
         self._armed_at: float | None = None  # s, monotonic
+        self._quiet_at = 0.0  # s, monotonic: when arming began to look for another master
         self._moved_at = 0.0  # s, monotonic: when the joints last changed, or were at their target
         self._reported: Emergency | None = None  # that was written to the log last
 
@@ -227,7 +228,7 @@ class CanopenDriver(Driver):
 
     def _quiet_sample(self) -> SyncSet:
         """Return a sample after ``foreign_quiet`` s without another master. Raises LinkError."""
-        begun = self._now()
+        begun = self._quiet_at = self._now()
         quiet = self.settings.foreign_quiet
         while True:
             foreign, now = self.foreign, self._now()
@@ -258,6 +259,7 @@ class CanopenDriver(Driver):
         try:
             self.power.prepare()
             hold = self.power.enable(sample, near, settings.arming_time, settings.clear_faults)
+            self._check_foreign()
             self.writer.send([self.power.following] * self.n, hold)
         except LinkError:
             with contextlib.suppress(LinkError):
@@ -267,14 +269,18 @@ class CanopenDriver(Driver):
         self._armed_at = self._moved_at = self._fresh_at = self._now()
         self._builder.reset()
 
+    def _check_foreign(self) -> None:
+        """Raise ForeignCommandError for another master since arming began."""
+        foreign = self.foreign
+        if foreign is not None and foreign.seen > self._quiet_at:
+            raise ForeignCommandError(self._two_masters(foreign))
+
     def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint, which counts at the next SYNC; needs ``arm`` before."""
         sample = self.sync_cycle.sample
         if self._armed_at is None or sample is None:
             raise WriteError(f"{self.master.where}: found a setpoint, expected arm() first")
-        foreign = self.foreign
-        if foreign is not None and foreign.seen > self._armed_at:
-            raise ForeignCommandError(self._two_masters(foreign))
+        self._check_foreign()
         joint = not_following(self.profile, sample)
         if joint is not None:
             node = self.profile.nodes[joint]

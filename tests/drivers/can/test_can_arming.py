@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from typing import Any
 
 import can
 import numpy as np
 import pytest
-from can_arm import UNIT, Served, next_state, other_bus, served_arm
+from can_arm import UNIT, Served, next_state, other_bus, served_arm, setpoint_of
 
-from gapbridge.core.errors import WriteError
+from gapbridge.core.errors import ForeignCommandError, WriteError
 from gapbridge.drivers.can.assembler import Sample
 
 
@@ -71,3 +72,20 @@ def test_joints_that_give_a_little_when_enabled_are_armed(
     read_wrong_when_enabled(monkeypatch, served, 0.5 * served.settings.arming_distance)
     served.driver.arm(next_state(served.driver))
     assert all(served.nodes.enabled)
+
+
+def test_another_commander_while_the_motors_are_enabled_is_not_forgotten(
+    served: Served, bus: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = served.driver.writer.run
+
+    def commanded(*given: Any) -> None:
+        monkeypatch.undo()  # the release runs a sequence too
+        bus.send(can.Message(arbitration_id=0x152, data=bytes(8), is_extended_id=False))
+        run(*given)
+
+    monkeypatch.setattr(served.driver.writer, "run", commanded)
+    with pytest.raises(ForeignCommandError, match="another commander sent 0x152"):
+        served.driver.arm(next_state(served.driver))
+    with pytest.raises(WriteError, match=r"expected arm\(\) first"):
+        served.driver.write_setpoint(setpoint_of(next_state(served.driver).actual_q))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import can
 import numpy as np
 import pytest
 from drive_arm import DriveArm, served, settled
+from patience import wait_for
 
-from gapbridge.core.errors import WriteError
+from gapbridge.core.errors import ForeignCommandError, WriteError
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.objects import ENABLE_OPERATION
 from gapbridge.drivers.canopen.state import states
@@ -78,3 +80,22 @@ def test_joints_that_give_a_little_when_enabled_are_armed(
     read_wrong_when_switched_on(monkeypatch, driver, 0.5 * driver.settings.arming_distance, 20)
     driver.arm(settled(driver))
     assert phases(arm) == {Phase.ENABLED}
+
+
+def test_another_master_while_the_drives_are_enabled_is_not_forgotten(
+    arm: DriveArm, driver: CanopenDriver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It writes a Controlword by SDO, once."""
+    prepare = driver.power.prepare
+    frame = can.Message(arbitration_id=0x601, data=b"\x2b\x40\x60\0\6\0\0\0", is_extended_id=False)
+
+    def commanded() -> None:
+        prepare()
+        with arm.other_bus() as bus:
+            bus.send(frame)
+        wait_for(lambda: driver.foreign is not None, "the other master's frame")
+
+    monkeypatch.setattr(driver.power, "prepare", commanded)
+    with pytest.raises(ForeignCommandError, match="another master sent SDO request to node 1"):
+        driver.arm(settled(driver))
+    assert Phase.ENABLED not in phases(arm)
