@@ -21,7 +21,7 @@ import numpy as np
 from gapbridge.core.errors import WriteError, first_line
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import Clock
-from gapbridge.drivers.robot_modes import PLAYING, why_not_ready
+from gapbridge.drivers.robot_modes import PAUSED, PLAYING, PROGRAM_STOPPED, why_not_ready
 from gapbridge.drivers.ur_rtde import registers
 from gapbridge.drivers.ur_rtde.registers import Program
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
@@ -44,6 +44,8 @@ INTEGERS = frozenset((
 """Calls and registers that may be used. The library's control script can run any motion and set any
 output, and RTDE inputs are anybody's: whatever these lists lack raises before the socket."""
 
+
+Look = Callable[[], RobotState | None]  # None: the sample is not valid
 
 _ABANDONED: list[Any] = []
 """Library objects of dead links: destroying them hangs or crashes the process, so they are kept
@@ -72,13 +74,16 @@ class ServoWriter:
         self._sent_at = np.zeros(KEPT)
         self._count = 0
 
-    def arm(self, state: RobotState, look: Callable[[], None]) -> None:
+    def arm(self, state: RobotState, look: Look) -> None:
         """Upload the control script and start the robot's watchdog. Raises WriteError."""
         host = self._settings.host
+        state = look() or state  # the controller was compared with the cell since, for seconds
         check_ready(host, state)
-        if state.runtime_state == PLAYING:
+        if state.runtime_state != PROGRAM_STOPPED:
+            number = state.runtime_state
+            what = {PLAYING: "running", PAUSED: "paused"}.get(number, f"in runtime_state {number}")
             raise WriteError(
-                f"{host}: found a program running on the controller, expected none: link.mode "
+                f"{host}: found a program {what} on the controller, expected none: link.mode "
                 "'servoj' would end it; stop it (an arming that was interrupted leaves its control "
                 "script), or use link.mode 'offset'"
             )
@@ -228,7 +233,7 @@ class OffsetWriter:
         """Return when the oldest offset not echoed yet was sent, s monotonic; infinite: none."""
         return self._unanswered[0][1] if self._unanswered else math.inf
 
-    def arm(self, state: RobotState, look: Callable[[], None]) -> None:
+    def arm(self, state: RobotState, look: Look) -> None:
         """Open the registers and send the rates. Raises WriteError if the program does not run.
 
         Waits until the program has ramped out any former offset, and sends an offset of zero.
@@ -264,7 +269,7 @@ class OffsetWriter:
             raise WriteError(f"{host}: {first_line(error)}") from None
         return io
 
-    def _wait_for_zero_offset(self, look: Callable[[], None]) -> None:
+    def _wait_for_zero_offset(self, look: Look) -> None:
         """Wait until the program has ramped out the offset of a former session, at its rates.
 
         Raises WriteError.
@@ -279,7 +284,7 @@ class OffsetWriter:
                 )
             look()
 
-    def _announce(self, look: Callable[[], None]) -> None:
+    def _announce(self, look: Look) -> None:
         """Send rates and an offset of zero until the program answers. Raises WriteError."""
         self._set(lambda io: io.setInputIntRegister(registers.RATES, self._rates))
         until = self._now() + max(self._settings.echo, ANNOUNCE_TIMEOUT)

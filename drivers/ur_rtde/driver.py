@@ -56,12 +56,12 @@ class UrRtdeDriver(Driver):
             self._writer.note_answer(self.reader.echo, self.reader.program, self.reader.applied)
         return self._state
 
-    def _look(self) -> None:
-        """Read a sample while arming. Raises WriteError."""
+    def _look(self) -> RobotState | None:
+        """Return a sample while arming; None: one that is not valid. Raises WriteError."""
         try:
-            self.read_state()
+            return self.read_state()
         except InvalidStateError:
-            pass
+            return None
         except LinkError as error:
             raise WriteError(str(error)) from None
 

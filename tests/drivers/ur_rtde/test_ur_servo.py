@@ -155,6 +155,25 @@ def test_a_running_program_is_not_ended_by_arming(offset_robot: SimulatedControl
 
 
 @pytest.mark.slow
+def test_a_paused_program_is_not_ended_by_arming(offset_robot: SimulatedController) -> None:
+    out = run_driver(
+        offset_robot.host,
+        """
+        import socket
+        driver.connect()
+        with socket.create_connection((host, 29999), timeout=5) as dashboard:
+            dashboard.sendall(b"pause\\n")
+            while read_state().runtime_state != 4:
+                pass
+        out["error"] = error_of(driver.arm, read_state())
+        out["runtime"] = read_for(50).runtime_state
+        """,
+    )
+    assert "found a program paused" in out["error"]
+    assert out["runtime"] == 4
+
+
+@pytest.mark.slow
 def test_writing_needs_arming_and_reading_first(controller: SimulatedController) -> None:
     out = run_driver(
         controller.host,

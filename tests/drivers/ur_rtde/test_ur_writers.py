@@ -14,7 +14,7 @@ from clock_by_hand import ByHand
 
 from gapbridge.core.errors import WriteError
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.robot_modes import PLAYING
+from gapbridge.drivers.robot_modes import PAUSED, PLAYING
 from gapbridge.drivers.ur_rtde import registers
 from gapbridge.drivers.ur_rtde.command import (
     CONTROL,
@@ -188,10 +188,23 @@ def test_a_refused_watchdog_leaves_no_script_of_ours_running(also: set[str]) -> 
     assert servo.library.calls[-1] == ("stopScript",)
 
 
-def test_a_running_program_is_not_ended_by_arming() -> None:
+@pytest.mark.parametrize(
+    ("runtime_state", "named"),
+    [(0, "in runtime_state 0"), (PLAYING, "running"), (3, "in"), (PAUSED, "paused"), (5, "in")],
+)
+def test_a_program_that_is_not_stopped_is_not_ended_by_arming(
+    runtime_state: int, named: str
+) -> None:
+    servo = Servo()
+    with pytest.raises(WriteError, match=f"found a program {named}"):
+        servo.arm(state(runtime_state=runtime_state), lambda: None)
+    assert not servo.library.calls
+
+
+def test_a_program_started_after_the_judged_sample_is_not_ended_by_arming() -> None:
     servo = Servo()
     with pytest.raises(WriteError, match="found a program running"):
-        servo.arm(state(runtime_state=PLAYING), lambda: None)
+        servo.arm(state(runtime_state=STOPPED), lambda: state(runtime_state=PLAYING))
     assert not servo.library.calls
 
 
