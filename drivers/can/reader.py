@@ -12,7 +12,7 @@ from gapbridge.core.errors import LinkError, first_line
 from gapbridge.drivers.can.assembler import Assembler, Sample
 from gapbridge.drivers.can.profile import CanProfile, Key, Status
 from gapbridge.drivers.can.settings import CanSettings
-from gapbridge.drivers.can_bus.bus import close_bus, open_bus
+from gapbridge.drivers.can_bus.bus import close_bus, is_own, open_bus
 from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.robot_modes import StopReason
 
@@ -118,7 +118,7 @@ class FrameReader:
         if frame.is_error_frame:
             self.error_frames += 1
             return None
-        if frame.is_remote_frame or frame.is_fd or not frame.is_rx:
+        if frame.is_remote_frame or frame.is_fd or is_own(frame, self._settings):
             return None
         key = (frame.arbitration_id, frame.is_extended_id)
         self.identifiers.add(key[0])

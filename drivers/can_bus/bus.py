@@ -11,7 +11,7 @@ import os
 import socket
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, ValidationInfo, field_validator
 
 from gapbridge.core.errors import LinkError, first_line
 from gapbridge.drivers.section import Host
@@ -70,6 +70,26 @@ class ArmBusSettings(BusSettings):
     arming_distance: float = Field(
         0.03, gt=0.0, le=0.3, description="rad that a joint may give while it is enabled"
     )
+
+    @field_validator("options")
+    @classmethod
+    def _no_echoes(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        """Refuse echoes of our own frames where they look like another program's; see is_own."""
+        if info.data.get("interface") == "socketcan" and value.get("receive_own_messages"):
+            raise ValueError(
+                "expected no receive_own_messages on socketcan: our own frames would be taken for "
+                "another commander's"
+            )
+        return value
+
+
+def is_own(frame: Any, settings: BusSettings) -> bool:
+    """Return whether a frame is one of ours that the interface returned.
+
+    On socketcan ``is_rx`` is False for a frame of any program on this computer, a second commander
+    there too, and ours are not returned.
+    """
+    return not frame.is_rx and settings.interface != "socketcan"
 
 
 def open_bus(settings: BusSettings, filters: list[can.typechecking.CanFilter] | None = None) -> Any:

@@ -8,6 +8,7 @@ from typing import Any
 
 from canopen.network import MessageListener, Network
 
+from gapbridge.drivers.can_bus.bus import is_own
 from gapbridge.drivers.canopen.objects import (
     HEARTBEAT_BASE,
     NMT,
@@ -18,6 +19,7 @@ from gapbridge.drivers.canopen.objects import (
     SYNC,
 )
 from gapbridge.drivers.canopen.profile import CanopenProfile
+from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.sync_set import SyncCollector
 from gapbridge.drivers.clock import Clock
 
@@ -49,9 +51,15 @@ class BusListener(MessageListener):
     """Passes frames to the collector and the canopen library; our own are not received."""
 
     def __init__(
-        self, network: Network, profile: CanopenProfile, collector: SyncCollector, clock: Clock
+        self,
+        network: Network,
+        settings: CanopenSettings,
+        profile: CanopenProfile,
+        collector: SyncCollector,
+        clock: Clock,
     ) -> None:
         super().__init__(network)
+        self._settings = settings
         self._clock = clock
         self._collector = collector
         self._commands = _commands(profile)
@@ -63,7 +71,9 @@ class BusListener(MessageListener):
         if msg.is_error_frame:
             self.error_frames += 1
             return
-        if msg.is_remote_frame or msg.is_extended_id or msg.is_fd or not msg.is_rx:
+        if msg.is_remote_frame or msg.is_extended_id or msg.is_fd:
+            return
+        if is_own(msg, self._settings):
             return
         now, cob_id = self._clock.monotonic(), int(msg.arbitration_id)
         what = self._commands.get(cob_id)

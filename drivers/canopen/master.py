@@ -83,7 +83,9 @@ class Master:
         self._listen(_Network(open_bus(self._settings), AllowedFrames(self._profile)))
 
     def _listen(self, network: Any) -> None:
-        self.listener = BusListener(network, self._profile, self.collector, self.clock)
+        self.listener = BusListener(
+            network, self._settings, self._profile, self.collector, self.clock
+        )
         network.listeners[:] = [self.listener]
         for node in self._profile.nodes:
             remote = network.add_node(node, self._profile.eds.dictionary(node))

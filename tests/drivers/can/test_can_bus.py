@@ -5,11 +5,19 @@ import time
 
 import can
 import pytest
+from canopen.network import Network
 from patience import PATIENCE, wait_for
 from pydantic import ValidationError
 
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.can.loading import read_profile
+from gapbridge.drivers.can.reader import FrameReader
+from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
+from gapbridge.drivers.canopen.listening import BusListener
+from gapbridge.drivers.canopen.profile import read_profile as read_canopen_profile
+from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.canopen.sync_set import SyncCollector
 from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.simulated.can.frame import Frame
 from gapbridge.drivers.simulated.can.hub import Hub
@@ -151,6 +159,49 @@ def test_an_interface_that_python_can_lacks_is_refused_with_those_it_has():
 def test_a_socketcan_channel_that_is_not_there_is_one_line():
     with pytest.raises(LinkError, match="socketcan nowhere0: cannot be opened"):
         open_bus(BusSettings(interface="socketcan", channel="nowhere0"))
+
+
+class Received:
+    """A bus on which these frames have arrived."""
+
+    def __init__(self, *frames):
+        self._frames = list(frames)
+
+    def recv(self, timeout):
+        return self._frames.pop(0) if self._frames else None
+
+
+@pytest.mark.parametrize(("interface", "is_heard"), [("socketcan", True), ("virtual", False)])
+def test_on_socketcan_a_frame_of_another_program_on_this_computer_is_heard(interface, is_heard):
+    """There ``is_rx`` is False for it; elsewhere such a frame is one of ours, come back."""
+    settings = CanSettings(profile="piper", interface=interface)
+    reader = FrameReader(settings, read_profile(settings.profile_path), SYSTEM)
+    reader.bus = Received(
+        can.Message(arbitration_id=0x2A5, data=bytes(8), is_extended_id=False, is_rx=False),
+        can.Message(arbitration_id=0x155, data=bytes(8), is_extended_id=False, is_rx=False),
+    )
+    reader.newest()
+    assert (reader.foreign is not None) == is_heard
+    assert reader.identifiers == ({0x2A5, 0x155} if is_heard else set())
+
+    drives = CanopenSettings(profile="cia402", interface=interface)
+    profile = read_canopen_profile(drives.profile_path)
+    listener = BusListener(Network(), drives, profile, SyncCollector(profile, SYSTEM), SYSTEM)
+    listener.on_message_received(
+        can.Message(arbitration_id=0x204, data=bytes(6), is_extended_id=False, is_rx=False)
+    )
+    assert (listener.foreign is not None) == is_heard
+
+
+@pytest.mark.parametrize("interface", ["socketcan", "virtual"])
+def test_echoes_of_our_own_frames_are_refused_where_they_look_like_others(interface):
+    given = {"interface": interface, "options": {"receive_own_messages": True}}
+    if interface == "virtual":
+        assert CanSettings(profile="piper", **given).options
+        return
+    for kind, profile in ((CanSettings, "piper"), (CanopenSettings, "cia402")):
+        with pytest.raises(ValidationError, match="no receive_own_messages on socketcan"):
+            kind(profile=profile, **given)
 
 
 def test_socketcan_where_vcan0_exists():

@@ -75,7 +75,7 @@ def test_a_million_frames_give_no_exception_and_no_wrong_sample() -> None:
     for node in profile.nodes:
         network.add_node(node, profile.eds.dictionary(node))
     heartbeats = HeartbeatMonitor(network, profile, SYSTEM)
-    listener = BusListener(network, profile, collector, SYSTEM)
+    listener = BusListener(network, CanopenSettings(profile="cia402"), profile, collector, SYSTEM)
     random, good = np.random.default_rng(4), good_frames(profile)
     count = taken = refused = 0
     begun = time.monotonic()
