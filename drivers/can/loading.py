@@ -76,6 +76,11 @@ class Names:
         message = self.dbc.messages.get(message_name)
         for signal in message.signals if message else ():
             if signal.name == signal_name:
+                if signal.multiplexer_ids is not None:
+                    raise self.dbc.error(
+                        message_name, signal_name,
+                        "found a multiplexed signal, expected one that is in every frame",
+                    )  # fmt: skip
                 return message, signal
         raise self.error(
             keys, f"found {name!r}, no signal of {self.dbc.path.name}{self.dbc.nearest(name)}"
@@ -131,6 +136,10 @@ class OutgoingLoading:
             if name not in known:
                 detail = f"found {name!r}, no signal of {message.name}: {', '.join(sorted(known))}"
                 raise self.names.error((*keys, "signals", name), detail)
+        if joints and message.is_multiplexed():
+            raise self.names.dbc.error(
+                message.name, "", "found a multiplexed message, expected one for joints that is not"
+            )
         filled = {name for name, _ in joints}
         if missing := known - filled - set(entry.signals):
             raise self.names.error(
@@ -354,6 +363,7 @@ class _Loading:
             raise self.names.error(
                 ("sample", "counter"), f"found {counter!r}, no signal of {message.name}"
             )
+        self.names.signal(f"{message.name}.{counter}", ("sample", "counter"))
         return counter
 
     def _check_sample(self, profile: CanProfile) -> None:
