@@ -110,13 +110,16 @@ def _blocks(groups: Iterable[list[Span]], gaps: bool) -> list[Block]:
 
 def _cut(group: list[Span], gaps: bool) -> list[Block]:
     """Return one block, or, where gaps cannot be read across, one for each unbroken run."""
-    ordered = sorted(group, key=lambda s: s.first)
+    entries: dict[Keys, tuple[int, int]] = {}  # each whole: a vector is never cut
+    for span in group:
+        first, end = entries.get(span.keys, (span.first, span.end))
+        entries[span.keys] = (min(first, span.first), max(end, span.end))
     runs: list[tuple[int, int]] = []
-    for span in ordered:
-        if runs and (gaps or span.first <= runs[-1][1]) and _fits(runs[-1][0], span.end):
-            runs[-1] = (runs[-1][0], max(runs[-1][1], span.end))
+    for first, end in sorted(entries.values()):
+        if runs and (gaps or first <= runs[-1][1]) and _fits(runs[-1][0], end):
+            runs[-1] = (runs[-1][0], max(runs[-1][1], end))
         else:
-            runs.append((span.first, span.end))
+            runs.append((first, end))
     main = min(s.first for s in group if s.keys == group[0].keys)
     blocks = [Block(group[0].table, first, end - first) for first, end in runs]
     return sorted(blocks, key=lambda b: not b.first <= main < b.first + b.count)

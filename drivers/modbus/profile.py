@@ -6,7 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from gapbridge.drivers.modbus.registers import BIT_TABLES, LAST_ADDRESS, UNITS, Table
+from gapbridge.drivers.modbus.registers import (
+    BIT_TABLES,
+    LAST_ADDRESS,
+    MOST_REGISTERS,
+    UNITS,
+    Table,
+)
 from gapbridge.drivers.modbus.schema import (
     Condition,
     Place,
@@ -55,6 +61,7 @@ def read_profile(path: Path, joints: int | None = None) -> ProfileFile:
     _check_vectors(document, profile)
     _check_places(document, profile)
     _check_overlap(document, profile)
+    _check_readable(document, profile)
     document.require_joints(profile.joints, joints)
     return profile
 
@@ -144,6 +151,29 @@ def _check_places(document: ProfileDocument, profile: ProfileFile) -> None:
         if span.end - 1 > LAST_ADDRESS:
             raise document.error(
                 (*span.keys, "address"), f"found {span.first}, whose last register is beyond 65535"
+            )
+
+
+def _check_readable(document: ProfileDocument, profile: ProfileFile) -> None:
+    """Refuse a vector of the state that no single request can read: it would be torn."""
+    state = [span for span in spans(profile) if span.keys[0] == "state"]
+    mapped = {(s.table, address) for s in state for address in range(s.first, s.end)}
+    vector_spans: dict[Keys, list[Span]] = {}
+    for span in state:
+        vector_spans.setdefault(span.keys, []).append(span)
+    for keys, own in vector_spans.items():
+        table, first, end = own[0].table, own[0].first, own[-1].end
+        if end - first > MOST_REGISTERS:
+            raise document.error(
+                (*keys, "address"),
+                f"found registers {first} to {end - 1}, expected at most {MOST_REGISTERS}: one "
+                "request reads no more",
+            )
+        if not profile.gaps and any((table, a) not in mapped for a in range(first, end)):
+            raise document.error(
+                (*keys, "stride"),
+                "found registers without a meaning between the numbers, which `gaps: false` "
+                "forbids to read",
             )
 
 

@@ -8,7 +8,7 @@ import pytest
 from contract_modbus import INVENTED
 
 from gapbridge.core.errors import InputError, InvalidStateError
-from gapbridge.drivers.modbus.decode import check_identity
+from gapbridge.drivers.modbus.decode import Decoder, check_identity
 from gapbridge.drivers.modbus.map import Block, compile_map
 from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import wire_of
@@ -99,6 +99,52 @@ def test_shipped_maps_are_read_in_blocks_that_hold_all_they_need(path: Path) -> 
         assert not compiled.slow
     if profile.write.mode == "read_only":
         assert not compiled.writable
+
+
+STRIDES = """\
+name: an arm
+joints: 6
+state:
+  position: {table: holding, address: 10, type: i16, scale: 0.01, unit: deg, stride: 2}
+write: {mode: read_only}
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("joints: 6\n", "joints: 6\ngaps: false\n",
+         "line 5: state.position.stride: found registers without a meaning between the numbers"),
+        ("stride: 2", "stride: 30", "line 4: state.position.address: found registers 10 to 160"),
+    ],
+)  # fmt: skip
+def test_a_vector_that_no_single_request_can_read_is_refused(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        read_profile(written(tmp_path, STRIDES.replace(old, new)), 6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("stride: 2", "stride: 24"),
+        ("stride: 2", "turns: {address: 130, type: i32}"),  # the 125th register is amid these
+        ("write:", "  velocity: {table: holding, address: 11, type: i16, scale: 1, unit: deg/s,"
+         " stride: 2}\nwrite:"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("gaps", [True, False])
+def test_whatever_map_is_taken_can_be_decoded(
+    tmp_path: Path, old: str, new: str, gaps: bool
+) -> None:
+    text = STRIDES.replace(old, new).replace("joints: 6", f"joints: 6\ngaps: {str(gaps).lower()}")
+    if not gaps and "stride: 24" in new:
+        return  # refused, see above
+    profile = read_profile(written(tmp_path, text), 6)
+    compiled = compile_map(profile)
+    sample = Decoder(profile, compiled).decode([bytes(2 * b.count) for b in compiled.blocks])
+    assert sample.vectors["position"].tolist() == [0.0] * 6
 
 
 def test_a_map_without_gaps_is_read_run_by_run(tmp_path: Path) -> None:
