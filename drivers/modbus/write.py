@@ -261,6 +261,8 @@ class TargetWriter:
         self._sent: dict[int, int] = {}
         self._target: Array | None = None
         self._since = 0.0
+        self._has_run = False  # the robot was busy since the last target was sent
+        self._result_before = ""  # what `result` said then; empty: nothing bad
 
     def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
         """Write speed and the like, once; no target, no trigger. Raises WriteError."""
@@ -281,8 +283,9 @@ class TargetWriter:
             registers = encode.vector_registers(entry, setpoint.q.tolist())
         except ValueError as error:
             raise WriteError(f"{self._transport.name}: target: {error}") from None
-        busy = any(text == "busy" for text, _ in sample.motion)
-        if busy or (registers == self._sent and self._off_target(sample).any()):
+        if "busy" in dict(sample.motion) or (
+            registers == self._sent and self._off_target(sample).any()
+        ):
             raise RobotBusyError(f"{self._transport.name}: the robot moves to the last target")
         if registers == self._sent:
             return
@@ -290,14 +293,21 @@ class TargetWriter:
             self._transport.write(entry.table, first, words, single=self._entry.single)
         self._write_all(self._entry.trigger, expiry)
         self._sent, self._since = registers, self._now()
+        self._has_run, self._result_before = False, dict(sample.motion).get("result", "")
         self._target = np.round(setpoint.q / self._size) * self._size
 
     def _check(self, sample: Sample) -> None:
-        """Raise WriteError if the last target was refused, or is not reached in time."""
-        for what, words in sample.motion:
-            if what == "result" and self._target is not None:
-                self._armed = False
-                raise WriteError(f"{self._transport.name}: the last target failed: {words}")
+        """Raise WriteError if the last target was refused, or is not reached in time.
+
+        While the robot is busy, and until it is, the result may be that of the command before.
+        """
+        motion = dict(sample.motion)
+        self._has_run |= "busy" in motion
+        words = motion.get("result", "")
+        is_ours = "busy" not in motion and (self._has_run or words != self._result_before)
+        if words and is_ours and self._target is not None:
+            self._armed = False
+            raise WriteError(f"{self._transport.name}: the last target failed: {words}")
         if self._target is None or self._now() - self._since < self._entry.following:
             return
         away = self._off_target(sample)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import types
 from typing import Any
 
@@ -322,6 +323,20 @@ def test_a_target_that_the_robot_refused_ends_the_writing() -> None:
     refused = wire.sample(q=q)._replace(motion=(("result", "out of reach"),))
     with pytest.raises(WriteError, match="the last target failed: out of reach"):
         writer.write(Setpoint(q, q, NOTHING), refused)
+
+
+def test_the_result_of_the_command_before_is_not_taken_for_ours() -> None:
+    writer, wire, _clock = target_writer()
+    before = ("result", "last command: found 3, expected 0 or 1")
+    q = np.zeros(6)
+    setpoint = Setpoint(q + 0.01, q, np.zeros(6))
+    for motion in ((before,), (before,), (("busy", "runs"), before)):
+        sample = wire.sample(q=q)._replace(motion=motion)
+        with contextlib.suppress(RobotBusyError):
+            writer.write(setpoint, sample)
+    done = wire.sample(q=q + 0.01)._replace(motion=(before,))
+    with pytest.raises(WriteError, match="the last target failed: last command: found 3"):
+        writer.write(setpoint, done)  # ours ran, and this is what it came to
 
 
 def test_a_target_that_failed_is_stopped_all_the_same() -> None:
