@@ -120,15 +120,11 @@ def _opened(settings: BusSettings, filters: Any, arguments: dict[str, Any]) -> A
         if settings.interface == "slcan":
             return _open_slcan(filters, arguments)
         return can.Bus(can_filters=filters, **arguments)
-    except (
-        can.CanError,
-        OSError,
-        ImportError,
-        TypeError,
-        ValueError,
-        NotImplementedError,
-    ) as error:
-        raise LinkError(f"{settings.where()}: cannot be opened: {first_line(error)}") from None
+    except Exception as error:  # NameError too: kvaser's without its library
+        missing = " (is its library installed?)" if isinstance(error, NameError) else ""
+        raise LinkError(
+            f"{settings.where()}: cannot be opened: {first_line(error)}{missing}"
+        ) from None
 
 
 def _open_slcan(filters: Any, arguments: dict[str, Any]) -> Any:

@@ -161,6 +161,17 @@ def test_a_socketcan_channel_that_is_not_there_is_one_line():
         open_bus(BusSettings(interface="socketcan", channel="nowhere0"))
 
 
+def test_an_interface_without_its_library_is_one_line(monkeypatch):
+    """As kvaser's without its: a name of it is not defined."""
+
+    def bus(**given):
+        raise NameError("name 'canGetNumberOfChannels' is not defined")
+
+    monkeypatch.setattr(can, "Bus", bus)
+    with pytest.raises(LinkError, match=r"^kvaser 0: cannot be opened: .* library installed\?\)$"):
+        open_bus(BusSettings(interface="kvaser", channel="0"))
+
+
 class Received:
     """A bus on which these frames have arrived."""
 
