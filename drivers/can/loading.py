@@ -177,12 +177,24 @@ class OutgoingLoading:
         return tuple(result)
 
     def control(self, sends: frozenset[Key]) -> frozenset[Key]:
-        """Return the identifiers that only a commander sends; requests for feedback are not."""
-        declared = frozenset(self.names.key(identifier) for identifier in self.file.control)
+        """Return the identifiers that only a commander sends.
+
+        Requests for feedback are not, except on an identifier that also commands.
+        """
+        file = self.file
+        declared = frozenset(self.names.key(identifier) for identifier in file.control)
+        steps = [*file.enable, *file.release, *file.stop]
+        entries = [
+            *(file.setpoint.frames if file.setpoint else ()),
+            *(f for s in steps for f in s.send),
+        ]
+        commands = {frame.message for frame in entries}
         requests = {
-            self.names.message(frame.message, ("request",))[1] for frame in self.file.request
+            self.names.message(frame.message, ("request",))[1]
+            for frame in file.request
+            if frame.message not in commands
         }
-        return (sends | declared) - requests
+        return (sends - requests) | declared
 
     def check_sends(self, profile: CanProfile) -> None:
         """Refuse a frame that is not on the allow-list, and feedback that we would send."""
@@ -271,7 +283,9 @@ class _Loading:
             if quantity is None:
                 continue
             unit = self._units(quantity, name, ("feedback", name))
-            by = {"torque": sign, "temperature": np.ones(self.n)}.get(name, sign / gear)
+            by = {"torque": sign * np.sign(gear), "temperature": np.ones(self.n)}.get(
+                name, sign / gear
+            )
             scale[name] = unit * by
         if file.setpoint is None:
             return JointMap(scale, zero, None, None)

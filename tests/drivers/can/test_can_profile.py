@@ -152,6 +152,32 @@ def test_every_shipped_profile_loads_and_its_setpoint_reads_back():
         assert again == pytest.approx(q, abs=np.max(profile.joints.resolution) / 2 + 1e-6)
 
 
+def test_a_request_on_an_identifier_that_commands_hides_no_other_commander(tmp_path):
+    """Many programs poll Damiao motors by setpoints without gain."""
+    shipped = CanSettings.shipped
+    shutil.copy(shipped / "openarm.dbc", tmp_path)
+    text = (shipped / "openarm.yaml").read_text()
+    poll = "{message: Query, signals: {motor: 1, what: 0xCC}}"
+    idle = "{message: Command1, signals: {position: 0, velocity: 0, kp: 0, kd: 0, torque: 0}}"
+    assert text.count(poll) == 1
+    path = tmp_path / "openarm.yaml"
+    path.write_text(text.replace(poll, idle))
+    assert read_profile(path).control == read_profile(shipped / "openarm.yaml").control
+    path.write_text(text + "control: [0x7FF]\n")  # whoever asks is a commander
+    assert (0x7FF, False) in read_profile(path).control
+
+
+def test_a_negative_gear_turns_torque_too_as_a_direction_does():
+    profiles = [
+        read_profile(CanSettings.shipped / "openarm.yaml", {key: [-1] * 7})
+        for key in ("gear", "direction")
+    ]
+    scales = [profile.joints.scale for profile in profiles]
+    assert set(scales[0]) >= {"position", "velocity", "torque"}
+    for name, scale in scales[0].items():
+        assert scale.tolist() == scales[1][name].tolist(), name
+
+
 def test_direction_zero_and_gear_of_the_installation_stand_before_the_profiles():
     profile = read_profile(
         CanSettings.shipped / "odrive.yaml",
