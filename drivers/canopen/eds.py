@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ class Eds:
     """One EDS. ``dictionary`` makes a fresh canopen.ObjectDictionary for a node."""
 
     path: Path
+    _objects: Any = field(compare=False, repr=False)  # the dictionary of one node, as it was read
 
     def dictionary(self, node: int) -> Any:
         """Return the object dictionary of one node; raises ProfileError."""
@@ -42,7 +43,7 @@ class Eds:
         """Return the variable at an address, None if the EDS has no number there."""
         import canopen.objectdictionary as library
 
-        entry = _entry(_cached(self.path), address)
+        entry = _entry(self._objects, address)
         if entry is None or entry.data_type not in library.INTEGER_TYPES:
             return None
         signed = entry.data_type in library.SIGNED_TYPES
@@ -50,18 +51,17 @@ class Eds:
 
     def has(self, address: Address) -> bool:
         """Return whether the EDS has an object at an address."""
-        return _entry(_cached(self.path), address) is not None
+        return _entry(self._objects, address) is not None
 
 
 def read_eds(path: Path, node: int) -> Eds:
     """Return an EDS of a drive. Raises ProfileError with a reason in one line."""
     if path.suffix.lower() not in SUFFIXES:
         raise ProfileError(f"found {path.name}, expected a file ending in {' or '.join(SUFFIXES)}")
-    eds = Eds(path)
-    dictionary = eds.dictionary(node)
-    if 0x6041 not in dictionary:
+    objects = _import(path, node)
+    if 0x6041 not in objects:
         raise ProfileError(f"{path}: found no Statusword (0x6041), expected the EDS of a drive")
-    return eds
+    return Eds(path, objects)
 
 
 def _import(path: Path, node: int) -> Any:
@@ -83,11 +83,6 @@ def _imported(name: str, text: str, node: int) -> bytes:
     source = io.StringIO(text)
     source.name = name  # the library takes the kind of file from it
     return pickle.dumps(canopen.import_od(source, node))
-
-
-@lru_cache(maxsize=8)
-def _cached(path: Path) -> Any:
-    return _import(path, 1)
 
 
 def _entry(dictionary: Any, address: Address) -> Any:

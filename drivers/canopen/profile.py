@@ -46,7 +46,10 @@ class Joint(Section):
 class Heartbeat(Section):
     """Periods and timeouts of heartbeats."""
 
-    drives: Positive = Field(default=0.1, description="s between two heartbeats of a drive")
+    drives: float = Field(
+        default=0.1, ge=0.001, le=65.0, allow_inf_nan=False,
+        description="s between two heartbeats of a drive",
+    )  # fmt: skip
     lost_after: Positive = Field(default=0.3, description="s without one: the drive is lost")
     ours: Positive = Field(default=0.05, description="s between two heartbeats of ours")
     drives_wait: float = Field(
@@ -193,6 +196,11 @@ def _check_times(document: ProfileDocument, file: ProfileFile) -> None:
             f"({file.sync_period:g} s)",
         )
     pairs = [("lost_after", beat.lost_after, "drives", beat.drives)]
+    if 0.0 < beat.drives_wait < 0.001:  # the object's unit is 1 ms, and 0 there is none
+        raise document.error(
+            ("heartbeat", "drives_wait"),
+            f"found {beat.drives_wait:g} s, expected 0 or at least 0.001 s",
+        )
     if beat.drives_wait:
         pairs.append(("drives_wait", beat.drives_wait, "ours", beat.ours))
     for key, wait, other, period in pairs:

@@ -10,6 +10,7 @@ import pytest
 
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.canopen.configure import interpolation_period
+from gapbridge.drivers.canopen.objects import Address
 from gapbridge.drivers.canopen.profile import read_profile
 from gapbridge.drivers.canopen.settings import CanopenSettings
 
@@ -85,6 +86,9 @@ WRONG = [
     ("  2: [Velocity", "  5: [Velocity", "tpdo.5: found 5"),
     ("sync_period: 0.004", "sync_period: 0.004\nsync_window: 0.004", "expected less than sync_per"),
     ("drives_wait: 0.25", "drives_wait: 0.06", "heartbeat.drives_wait: found 0.06 s"),
+    ("drives: 0.1", "drives: 0.0004", "heartbeat.drives: found 0.0004, expected"),
+    ("drives: 0.1", "drives: 70", "heartbeat.drives: found 70, expected"),
+    ("drives_wait: 0.25", "drives_wait: 0.0004", "found 0.0004 s, expected 0 or at least 0.001"),
     ("lost_after: 0.3", "lost_after: 0.1", "expected at least 1.5 times heartbeat.drives"),
     ("name: six", "name: x\nname: six", "found twice"),
 ]
@@ -115,6 +119,17 @@ def test_an_eds_that_is_no_drives_is_refused(copy: Path) -> None:
     eds.write_text(eds.read_text().replace("0x6041", "0x6043").replace("[6041]", "[6043]"))
     with pytest.raises(InputError, match="no Statusword"):
         read_profile(copy)
+
+
+def test_an_eds_that_was_corrected_is_read_anew(copy: Path) -> None:
+    eds = copy.with_name("cia402.eds")
+    good = eds.read_text()
+    start = good.index("[6077]")
+    eds.write_text(good[:start] + good[good.index("[", start + 1) :])
+    with pytest.raises(InputError, match="Torque actual value"):
+        read_profile(copy)
+    eds.write_text(good)
+    assert read_profile(copy).eds.has(Address(0x6077, 0))
 
 
 def test_a_broken_eds_is_reported_in_one_line(copy: Path) -> None:
