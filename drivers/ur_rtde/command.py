@@ -373,7 +373,19 @@ class AllowedControl:
     def __init__(self, host: str, library: Any) -> None:
         self._host, self._library = host, library  # kept: destroying it is not safe
         for name in CONTROL:
-            setattr(self, name, getattr(library, name))
+            setattr(self, name, self._call_of(name))
+
+    def _call_of(self, name: str) -> Callable[..., Any]:
+        """Return a call of the library that raises WriteError where the library raises."""
+        known = getattr(self._library, name)
+
+        def call(*given: Any) -> Any:
+            try:
+                return known(*given)
+            except Exception as error:  # RuntimeError of a connection that has ended
+                raise WriteError(f"{self._host}: {name}: {first_line(error)}") from None
+
+        return call
 
     def __getattr__(self, name: str) -> Any:
         """Refuse every other call. Raises WriteError."""

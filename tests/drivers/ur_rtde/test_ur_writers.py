@@ -40,10 +40,13 @@ class Library:
     def __init__(self) -> None:
         self.calls: list[tuple[Any, ...]] = []
         self.refused: set[str] = set()
+        self.broken = False  # the connection has ended: every call raises
 
     def __getattr__(self, name: str) -> Callable[..., bool]:
         def call(*given: Any) -> bool:
             self.calls.append((name, *given))
+            if self.broken:
+                raise RuntimeError("write: Broken pipe [system:32]\nat boost/asio")
             return name not in self.refused
 
         return call
@@ -217,6 +220,24 @@ def test_a_stopped_robot_is_not_armed(kind: Any, stopped: dict[str, int]) -> Non
     with pytest.raises(WriteError, match="expected robot_mode 7"):
         writer.arm(state(**stopped), lambda: None)
     assert not writer.library.calls
+
+
+def test_what_the_library_raises_is_a_failed_write_in_one_line(servo: Servo) -> None:
+    servo.library.broken = True
+    stopped = state(runtime_state=STOPPED)
+    for action in (
+        lambda: servo.arm(stopped, lambda: None),
+        lambda: servo.write(setpoint(), state()),
+        servo.release,
+    ):
+        with pytest.raises(
+            WriteError, match=r"^192\.0\.2\.7: is\w+: write: Broken pipe \[system:32\]$"
+        ):
+            action()
+    again = Servo()
+    again.library.broken = True
+    with pytest.raises(WriteError, match=r"setWatchdog: write: Broken pipe"):
+        again.arm(stopped, lambda: None)
 
 
 def test_letting_go_brakes_and_then_ends_the_script(servo: Servo) -> None:
