@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar, Self
@@ -29,6 +30,11 @@ class DriverSettings(Section):
     def moves_arm(self) -> bool:
         """Return whether setpoints are the arm's motion; False: offsets on the robot's own."""
         return True
+
+    @property
+    def largest_offset(self) -> tuple[float, float]:
+        """Return the largest offset that can be sent, m and rad. Raises InputError."""
+        return math.inf, math.inf
 
     def read_files(self) -> None:
         """Read, through core.files, all files that the driver will read. Raises InputError."""

@@ -44,6 +44,20 @@ class DaemonSettings(Section):
     )
 
     @model_validator(mode="after")
+    def _limits_fit_link(self) -> DaemonSettings:
+        """Refuse offsets that the link cannot send: the motion would end amid one. CellError."""
+        keys = ("offset", "m"), ("offset_rotation", "rad")
+        for (key, unit), most in zip(keys, self.link.largest_offset, strict=True):
+            found = getattr(self.limits, key)
+            if found > most:
+                raise CellError(
+                    f"found {found:g} {unit}, expected at most {most:g}: the link's registers "
+                    "hold no more (write.length_count, write.angle_count of its profile)",
+                    ("limits", key),
+                )
+        return self
+
+    @model_validator(mode="after")
     def _source_fits_link(self) -> DaemonSettings:
         """Refuse a setpoint source where the robot's own program moves the arm: CellError."""
         if not self.link.moves_arm and self.setpoints.source != "target":

@@ -84,6 +84,17 @@ class ModbusSettings(ProfileSettings):
 
         return read_profile(self.profile_path).write.mode != "mailbox"
 
+    @property
+    def largest_offset(self) -> tuple[float, float]:
+        """Return what a mailbox's 16 bits hold, m and rad. Raises InputError: see moves_arm."""
+        from gapbridge.drivers.modbus.encode import LARGEST
+        from gapbridge.drivers.modbus.profile import read_profile
+
+        write = read_profile(self.profile_path).write
+        if write.mode != "mailbox":
+            return super().largest_offset
+        return LARGEST * write.length_count, LARGEST * write.angle_count
+
     def read_files(self) -> None:
         """Read the profile; see DriverSettings."""
         from gapbridge.drivers.modbus.profile import read_profile

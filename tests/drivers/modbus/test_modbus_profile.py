@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from contract_modbus import INVENTED
 
+from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.core.errors import InputError, InvalidStateError
 from gapbridge.drivers.modbus.decode import Decoder, check_identity
 from gapbridge.drivers.modbus.map import Block, compile_map
@@ -145,6 +146,30 @@ def test_whatever_map_is_taken_can_be_decoded(
     compiled = compile_map(profile)
     sample = Decoder(profile, compiled).decode([bytes(2 * b.count) for b in compiled.blocks])
     assert sample.vectors["position"].tolist() == [0.0] * 6
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ("offset: 0.1", "limits.offset: found 0.1 m, expected at most 0.032767"),
+        ("offset_rotation: 0.2", "limits.offset_rotation: found 0.2 rad, expected at most 0.0327"),
+        ("offset: 0.03", ""),
+    ],
+)
+def test_limits_beyond_a_mailboxs_registers_are_refused(
+    tmp_path: Path, limits: str, words: str
+) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(
+        "robot: {model: ur10e}\n"
+        "link: {driver: modbus, profile: ur, host: 127.0.0.2}\n"
+        f"limits: {{{limits}}}\n"
+    )
+    if not words:
+        assert read_configuration(cell).settings.limits.offset == 0.03
+        return
+    with pytest.raises(InputError, match=f"line 3: {words}"):
+        read_configuration(cell)
 
 
 def test_a_map_without_gaps_is_read_run_by_run(tmp_path: Path) -> None:
