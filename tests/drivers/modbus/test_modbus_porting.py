@@ -41,6 +41,13 @@ def test_the_map_of_the_page_reads_writes_and_is_reported_when_wrong(profile: Pa
         read_profile(profile)
 
 
+def test_the_robots_program_of_the_page_uses_only_the_words_that_it_checked() -> None:
+    """A register that is read again may belong to the next offset by then."""
+    [program] = re.findall(r"```\n(def gapbridge_mailbox.*?)```", PORTING, re.DOTALL)
+    assert re.findall(r"read_port_register\((.*?)\)", program) == ["234 + i", "244"]
+    assert "words[i] = read_port_register(234 + i)\n" in program
+
+
 def test_the_checksum_is_the_one_on_the_page() -> None:
     words = [7, 100, 65436, 3, 4, 65531, 6, 9, 2500, 1000]
     formula = re.search(r"\((\d+) \+ 1 w0 \+ 2 w1 .*modulo (\d+)", PORTING)
