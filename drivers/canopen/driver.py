@@ -255,6 +255,7 @@ class CanopenDriver(Driver):
             return present
 
         near(sample)
+        self.power.check_modes(sample)
         self.writer.load()  # first: without it nothing can be sent, not even what disables
         try:
             self.power.prepare()

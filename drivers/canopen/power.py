@@ -46,13 +46,28 @@ class Power:
         self._master, self._profile, self._writer = master, profile, writer
         self._exchange, self._now = exchange, master.clock.monotonic
         self._modes: dict[int, int] = {}  # node -> Modes of operation before
-        self._watched: list[int] = []  # nodes that watch our heartbeat
+        self._values: dict[tuple[int, Address], int] = {}  # node, object -> its value before
 
     @property
     def following(self) -> int:
         """Return the Controlword of a drive that follows setpoints."""
         interpolated = self._profile.file.mode == "interpolated position"
         return ENABLE_OPERATION | (ENABLE_INTERPOLATION if interpolated else 0)
+
+    def check_modes(self, sample: SyncSet) -> None:
+        """Refuse a drive that somebody left enabled in another mode. Raises LinkError.
+
+        At the change of mode it may follow a target of long ago, before ours reaches it.
+        """
+        for node, state in zip(self._profile.nodes, states(sample), strict=True):
+            if state != "OPERATION ENABLED":
+                continue
+            mode = self._master.read(node, MODES_OF_OPERATION)
+            if mode != self._profile.mode_number:
+                raise WriteError(
+                    f"{self._master.where}: node {node}: found {state} in mode {mode}, expected a "
+                    "drive that is off: it may jump when its mode is changed"
+                )
 
     def prepare(self) -> None:
         """Choose the mode, and have the drives watch our heartbeat. Raises LinkError."""
@@ -63,20 +78,31 @@ class Power:
                 self._modes[node] = master.read(node, MODES_OF_OPERATION)
             master.write(node, MODES_OF_OPERATION, profile.mode_number)
             if beat.drives_wait:
-                master.write_where_present(node, ABORT_CONNECTION, STOP_AT_LOSS)
+                self._replace(node, ABORT_CONNECTION, STOP_AT_LOSS)
                 watched = beat.our_node << 16 | round(1e3 * beat.drives_wait)
-                if not master.write_where_present(node, CONSUMER_HEARTBEAT, watched):
+                if not self._replace(node, CONSUMER_HEARTBEAT, watched):
                     raise LinkError(
                         f"{master.where}: node {node} cannot watch our heartbeat (no 0x1016): it "
                         "would go on when we are gone; heartbeat.drives_wait 0 accepts that"
                     )
-                self._watched.append(node)
+
+    def _replace(self, node: int, address: Address, value: int) -> bool:
+        """Write an object until ``restore``; returns whether the drive has it. Raises LinkError."""
+        before = self._master.read_where_present(node, address)
+        if before is None:
+            return False
+        if address == CONSUMER_HEARTBEAT and before >> 16 & 0x7F == value >> 16:
+            before = 0  # ours, of a process that was killed: our heartbeat will end
+        self._values.setdefault((node, address), before)
+        self._master.write(node, address, value)
+        return True
 
     def restore(self) -> None:
         """Put back what ``prepare`` changed. Raises LinkError."""
-        while self._watched:
+        for (node, address), value in reversed(list(self._values.items())):
             self._master.beat()
-            self._master.write(self._watched.pop(), CONSUMER_HEARTBEAT, 0)
+            self._master.write(node, address, value)
+            del self._values[node, address]
         for node, mode in list(self._modes.items()):
             self._master.write(node, MODES_OF_OPERATION, mode)
             del self._modes[node]

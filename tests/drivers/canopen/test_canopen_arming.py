@@ -13,10 +13,16 @@ from patience import wait_for
 from gapbridge.core.errors import ForeignCommandError, WriteError
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.objects import ENABLE_OPERATION
+from gapbridge.drivers.canopen.power import (
+    ABORT_CONNECTION,
+    CONSUMER_HEARTBEAT,
+    MODES_OF_OPERATION,
+)
 from gapbridge.drivers.canopen.state import states
 from gapbridge.drivers.canopen.sync_set import SyncSet
 from gapbridge.drivers.simulated.canopen.machine import Phase
 
+INTERPOLATED_POSITION = 7  # a mode of operation
 SWITCHED_ON = {"SWITCHED ON", "OPERATION ENABLED"}
 
 
@@ -80,6 +86,37 @@ def test_joints_that_give_a_little_when_enabled_are_armed(
     read_wrong_when_switched_on(monkeypatch, driver, 0.5 * driver.settings.arming_distance, 20)
     driver.arm(settled(driver))
     assert phases(arm) == {Phase.ENABLED}
+
+
+def test_a_drive_that_is_enabled_in_another_mode_is_left_alone(
+    arm: DriveArm, driver: CanopenDriver
+) -> None:
+    """It may jump to an old target at the change of mode; nothing is written to any drive."""
+    node, drive = driver.profile.nodes[2], arm.server.drives[2]
+    driver.master.write(node, MODES_OF_OPERATION, INTERPOLATED_POSITION)
+    drive.axis.machine.phase = Phase.ENABLED
+    with pytest.raises(WriteError, match=f"node {node}: found OPERATION ENABLED in mode 7"):
+        driver.arm(settled(driver))
+    assert drive.axis.mode == INTERPOLATED_POSITION
+    assert drive.axis.machine.phase == Phase.ENABLED
+    assert {other.axis.mode for other in arm.server.drives} == {0, INTERPOLATED_POSITION}
+
+
+def test_release_gives_the_drives_back_what_they_watched(
+    arm: DriveArm, driver: CanopenDriver
+) -> None:
+    """A PLC's heartbeat and an option code are put back; a watch of ours, left behind, is not."""
+    nodes, ours = driver.profile.nodes, driver.profile.heartbeat.our_node
+    for node, watched in zip(nodes, (0x7E00FA, ours << 16 | 250, 0), strict=False):
+        driver.master.write(node, CONSUMER_HEARTBEAT, watched)
+    driver.master.write(nodes[0], ABORT_CONNECTION, 2)
+    driver.arm(settled(driver))
+    drives = arm.server.drives
+    assert {drive.number(0x1016, 1) >> 16 for drive in drives} == {ours}
+    assert {drive.number(0x6007) for drive in drives} == {3}
+    driver.release()
+    assert [drive.number(0x1016, 1) for drive in drives[:3]] == [0x7E00FA, 0, 0]
+    assert drives[0].number(0x6007) == 2
 
 
 def test_another_master_while_the_drives_are_enabled_is_not_forgotten(
