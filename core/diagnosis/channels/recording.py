@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.arrays import Array, Index
+from gapbridge.core.arrays import Array, Index, Mask
 from gapbridge.core.derivatives import signal_noise
 from gapbridge.core.diagnosis.criteria import MIN_TORQUE_CHANGE, STEPPED_SHARE
 from gapbridge.core.diagnosis.observation import HELD_TORQUE
@@ -29,6 +29,21 @@ def subsampled(log: Log, usable: NDArray[np.bool_], motion: Motion) -> Index:
     """Return at most MAX_POSES of the ``usable`` rows (N,) of a log's motion, as indices to it."""
     rows = np.flatnonzero(usable)
     return rows[drawn(session_of(log)[motion.rows[rows]], MAX_POSES)]
+
+
+def unchanging(log: Log, readings: Array) -> Mask:
+    """Return the rows (N,) of sessions in which none of the ``readings`` (N, k) ever changes.
+
+    So records a sensor that is not there (zeros), or one that stands still.
+    """
+    still = np.zeros(len(log), dtype=bool)
+    finite = np.isfinite(readings).all(axis=1)
+    session = session_of(log)
+    for number in np.unique(session):
+        rows = session == number
+        known = readings[rows & finite]
+        still[rows] = len(known) > 1 and bool((known == known[0]).all())
+    return still
 
 
 def conditions(motion: Motion) -> Index:

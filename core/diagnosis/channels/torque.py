@@ -15,6 +15,7 @@ from gapbridge.core.diagnosis.channels.recording import (
     own_joints,
     quantities,
     subsampled,
+    unchanging,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_loads
@@ -36,7 +37,8 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
 
     Rows without derivatives (edges, gaps), with a torque that is not finite, or with a joint that
     reverses (unknown sign of friction) are left out. Of more than 30,000 poses at rest 30,000 are
-    taken. Not observable if the links have no mass or the torques are constant.
+    taken. Not observable if the links have no mass or the torques are constant; a session whose
+    torques are constant is left out.
     Raises LogError if the log holds something unusable.
     """
     measured = log.get("actual_current_as_torque")
@@ -44,13 +46,13 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if measured is None or needs:
         return NotObservable("torque", needs)
     whole = motion_of(log)
+    still = unchanging(log, measured)
+    measured = np.where(still[:, None], np.nan, measured)
     finite = np.isfinite(measured[whole.rows]).all(axis=1)
     rows = subsampled(log, whole.valid & finite & _steady(whole), whole)
     if not len(rows):
-        return NotObservable("torque", ("actual_current_as_torque",))
-    known = measured[np.isfinite(measured).all(axis=1)]
-    if len(known) > 1 and (known == known[0]).all():
-        return NotObservable("torque", ("actual_current_as_torque that changes",))
+        changing = " that changes" if still.any() else ""
+        return NotObservable("torque", (f"actual_current_as_torque{changing}",))
     return _observed(model, log, measured, whole, rows)
 
 

@@ -15,6 +15,7 @@ from gapbridge.core.diagnosis.channels.recording import (
     instrument_noise,
     quantities,
     subsampled,
+    unchanging,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_loads
@@ -37,7 +38,8 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
 
     Torques are weighted by the ratio of the noise of forces to that of torques. Rows without
     derivatives and rows whose wrench is not finite are left out. Of more than 30,000 poses at rest
-    30,000 are taken. Raises LogError if the log holds something unusable.
+    30,000 are taken. Not observable if the readings are constant: a sensor that is not there; a
+    session in which they are is left out. Raises LogError if the log holds something unusable.
     """
     measured = log.get("ft_raw_wrench")
     needs = [] if measured is not None else ["ft_raw_wrench"]
@@ -46,9 +48,12 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if measured is None or needs:
         return NotObservable("wrench", tuple(needs))
     whole = motion_of(log)
+    still = unchanging(log, measured)
+    measured = np.where(still[:, None], np.nan, measured)
     rows = subsampled(log, whole.valid & np.isfinite(measured[whole.rows]).all(axis=1), whole)
     if not len(rows):
-        return NotObservable("wrench", ("ft_raw_wrench",))
+        changing = " that changes" if still.any() else ""
+        return NotObservable("wrench", (f"ft_raw_wrench{changing}",))
     return _observed(model, log, measured, whole, rows)
 
 

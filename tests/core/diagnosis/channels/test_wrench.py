@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import moving_truth as truth
 import numpy as np
 import pytest
@@ -10,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from gapbridge.core.diagnosis.channels.wrench import observe, torque_weight
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import ChannelFinding, Check, NotAccused
-from gapbridge.core.diagnosis.observation import NotObservable
+from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.metrology import Metrology
+from gapbridge.core.sessions import join_sessions
 
 METROLOGY = Metrology()
 N, ROWS = 7, 70
@@ -100,7 +103,7 @@ def test_pairs_that_look_alike_are_separated_by_pulls_and_payloads(plant, sessio
 
 def test_equal_gains_and_one_payload_are_the_same(plant):
     q = truth.poses(N, 40, 5)
-    log = truth.log_of(N, actual_q=q, ft_raw_wrench=np.zeros((40, 6)))
+    log = truth.log_of(N, actual_q=q, ft_raw_wrench=np.eye(40, 6))
     seen = observe(plant.model(2.0), log, METROLOGY)
     heavier = seen.predict([Term("payload", Site(), (0.1,))])
     scaled = seen.predict([Term("ft_gain", Site(), (0.05,) * 6)])
@@ -129,7 +132,7 @@ def test_a_moving_payload_shows_its_inertia(plant):
 def test_few_poses_with_many_loads_are_held_out_by_load(plant):
     q = np.repeat(truth.poses(N, 2, 0), 12, axis=0)
     mass = np.tile(np.arange(6.0), 4)
-    log = truth.log_of(N, actual_q=q, payload=mass, ft_raw_wrench=np.zeros((24, 6)))
+    log = truth.log_of(N, actual_q=q, payload=mass, ft_raw_wrench=np.eye(24, 6))
     seen = observe(plant.model(), log, METROLOGY)
     assert len(np.unique(seen.groups)) == 12
 
@@ -226,3 +229,25 @@ def test_no_gap_is_larger_per_coordinate_than_at_most(plant):
     log = truth.log_of(N, timestamp=np.arange(60) * 20.0, actual_q=q, ft_raw_wrench=twisted)
     (channel,) = diagnose(plant.model(2.0), log, METROLOGY).channels
     assert channel.gap_rms < channel.gap_max < np.sqrt(6) * channel.gap_rms * 3
+
+
+@pytest.mark.parametrize("stands", [np.zeros(6), 4 * BIAS], ids=["zeros", "frozen"])
+def test_readings_that_never_change_are_no_load(plant, session, stands):
+    """No sensor, or one that stands still: its 0 N was a payload of -2 kg, with certainty."""
+    model = plant.model(2.0)
+    dead = log_of(session, np.zeros((ROWS, 6)))
+    dead = replace(dead, columns={**dead.columns, "ft_raw_wrench": np.tile(stands, (ROWS, 1))})
+    assert observe(model, dead, METROLOGY) == NotObservable(
+        "wrench", ("ft_raw_wrench that changes",)
+    )
+    q, mass, pull, _ = session
+    torque = plant.dynamics(q, 0 * q, 0 * q, pull, mass)[0]
+    noise = np.random.default_rng(3).normal(0, 0.1, torque.shape)
+    held = {**dead.columns, "actual_current_as_torque": torque + noise}
+    found = diagnose(model, replace(dead, columns=held), METROLOGY)
+    assert [channel.channel for channel in found.channels] == ["torque"]
+    assert not found.channels[0].causes
+    alive = replace(log_of(session, session[3]), path="alive.csv")
+    seen = observe(model, join_sessions([alive, dead], model), METROLOGY)
+    assert isinstance(seen, Observation)
+    assert seen.rows.max() < ROWS  # of two sessions, that whose sensor measures
