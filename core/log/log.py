@@ -239,8 +239,8 @@ def encoding_of(path: Path, head: bytes) -> str:
     return "utf-16" if head[:2] in UTF_16 else "utf-8-sig"
 
 
-def _text(path: Path) -> str:
-    """Return a text file, unpacked where it is gzip."""
+def text_of(path: Path) -> str:
+    """Return the text of a log, unpacked where it is gzip. Raises LogError."""
     try:
         data = read_bytes(path)
         if data[:2] == GZIP:
@@ -259,7 +259,7 @@ def _read_csv(path: Path) -> tuple[list[str], Array, Index | None]:
     with # are comments, blank ones before the header are left out; with semicolons between the
     cells a comma may stand for the decimal point.
     """
-    every = _text(path).rstrip().split("\n")
+    every = text_of(path).rstrip().split("\n")
     kept = [number for number, line in enumerate(every, start=1) if not is_comment(line)]
     kept = list(dropwhile(lambda number: not every[number - 1].strip(), kept))
     lines = [every[number - 1] for number in kept]

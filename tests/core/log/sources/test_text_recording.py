@@ -58,8 +58,11 @@ def test_a_log_is_no_other_source(tmp_path: Path) -> None:
 def test_text_among_the_numbers_is_one_clear_line(tmp_path: Path) -> None:
     franka(tmp_path / "log.csv")
     with (tmp_path / "log.csv").open("a") as file:
-        file.write("5,1,what\n")
-    with pytest.raises(LogError, match=r"log.csv: found .*expected rows of numbers"):
+        file.write("5,what" + ",1" * 49 + "\n")
+    assert source_of(tmp_path / "log.csv").read(tmp_path / "log.csv", (), SourceOptions())
+    with (tmp_path / "log.csv").open("a") as file:
+        file.write("6,1,what" + ",1" * 48 + "\n")
+    with pytest.raises(LogError, match=r"log.csv: row 8, column actual_q_0: found 'what', expect"):
         source_of(tmp_path / "log.csv").read(tmp_path / "log.csv", (), SourceOptions())
 
 
@@ -93,3 +96,34 @@ def test_a_franka_log_has_to_have_its_times(tmp_path: Path) -> None:
     path.write_text("state.q[0],state.q[1]\n0.1,0.2\n")
     with pytest.raises(LogError, match=r"log\.csv: column time: not found, expected it \(ms\)"):
         source_of(path).read(path, (), SourceOptions())
+
+
+def test_an_empty_cell_between_tabs_is_a_missing_reading(tmp_path: Path) -> None:
+    """Not the next column's value: the three positions of a lost target were joints' angles."""
+    path = tmp_path / "robot.txt"
+    names = ["timestamp", "robot mode", *(f"measured_position_{i}" for i in range(3)),
+             *(f"actual_q_{i}" for i in range(6)), "a", "b", "c"]  # fmt: skip
+    cells = ["0", "7", *"123", *(f"0,{i}" for i in range(1, 7)), *"777"]
+    lost = [*cells[:2], "", "", "", *cells[5:]]
+    path.write_text("\n".join("\t".join(row) for row in (names, cells, lost, cells)) + "\n")
+    found = source_of(path).read(path, (), SourceOptions()).columns
+    assert np.allclose(found["actual_q"], [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]] * 3)
+    assert np.isnan(found["measured_position"][1]).all()
+    assert np.isfinite(found["measured_position"][[0, 2]]).all()
+
+
+def test_a_row_with_another_number_of_cells_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "robot.txt"
+    names = ["timestamp", "note", *(f"actual_q_{i}" for i in range(6))]
+    row = "0 7 0.1 0.2 0.3 0.4 0.5 0.6"
+    path.write_text("\n".join([" ".join(names), row, "", row + " 0.7"]) + "\n")
+    with pytest.raises(LogError, match=r"robot\.txt: row 4: found 9 cells, expected 8"):
+        source_of(path).read(path, (), SourceOptions())
+
+
+def test_decimal_commas_between_commas_are_refused(tmp_path: Path) -> None:
+    franka(tmp_path / "log.csv", rows=1)
+    header, row = (tmp_path / "log.csv").read_text().splitlines()
+    (tmp_path / "log.csv").write_text(header + "\n" + row.replace(".", ",") + "\n")
+    with pytest.raises(LogError, match=r"log\.csv: row 2: found \d+ cells, expected 51"):
+        source_of(tmp_path / "log.csv").read(tmp_path / "log.csv", (), SourceOptions())
