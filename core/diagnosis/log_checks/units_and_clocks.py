@@ -15,7 +15,7 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
-from gapbridge.core.motion import time_finding
+from gapbridge.core.motion import MAX_SAMPLE_TIME, time_finding
 
 MAX_ANGLE = 25.0  # rad: larger joint angles are degrees
 MIN_LIMIT = 7.0  # rad: a little more than one turn, which any encoder may report
@@ -26,6 +26,9 @@ OVERLOAD = 10.0  # times the rated payload (or the arm's own weight): grams
 MAX_TEMPERATURE = 200.0  # °C: larger values are kelvin
 FAHRENHEIT_FROM = 95.0  # °C: arms stop before
 MAX_ROTATION = 2 * np.pi + 0.3  # rad, of a rotation vector
+MIN_SPEED = 0.05  # rad/s, from which a joint's way tells the time that it took
+MIN_STEPS = 20  # of a joint at such a speed, to tell the unit of the times
+TIME_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # s
 MIN_POSES = 15
 AT_ONCE = 1000  # rows
 READINGS = (
@@ -37,11 +40,13 @@ def check_units(model: Model, log: Log) -> None:
     """Raise LogError if a column's values can only be in another unit.
 
     Joints or rotations in degrees, positions or centres of gravity in millimetres, payloads in
-    grams, temperatures in kelvin; also for an infinite joint angle, with its row.
+    grams, temperatures in kelvin, times in fractions of a second; also for an infinite joint
+    angle, with its row.
     """
     for name in ("actual_q", "target_q"):
         _check_angles(model, log, name)
     _check_positions(model, log)
+    _check_times(log)
     reach = _reach(model)
     heaviest, largest_cog = OVERLOAD * _usual_load(model), MAX_COG_REACHES * reach + 1
     for name, most, what in (
@@ -106,6 +111,33 @@ def _check_positions(model: Model, log: Log) -> None:
             f"{log.path}: columns measured_position_*: found positions {size:g} apart for an arm "
             f"of {reach:.2f} m reach; the positions look like millimetres, expected m"
         )
+
+
+def _check_times(log: Log) -> None:
+    """Compare the steps of time with those that the joints' speeds need for their way.
+
+    A log with such steps would count as poses at rest.
+    """
+    t, q, qd = (log.get(name) for name in ("timestamp", "actual_q", "actual_qd"))
+    if t is None or q is None or qd is None or len(t) <= MIN_STEPS:
+        return
+    steps = np.diff(t)
+    forward = np.flatnonzero(steps > 0)
+    step = float(np.median(steps[forward])) if len(forward) else 0.0
+    if step <= MAX_SAMPLE_TIME:
+        return
+    way, speed = np.abs(np.diff(q, axis=0))[forward], np.abs(qd[1:])[forward]
+    known = (speed > MIN_SPEED) & np.isfinite(way) & np.isfinite(speed)
+    if known.sum() < MIN_STEPS:
+        return
+    took = way[known] / speed[known]  # s
+    shares = np.quantile(took / np.repeat(steps[forward], known.sum(axis=1)), (0.25, 0.75))
+    for name, unit in TIME_UNITS.items():
+        if unit / 2 < shares[0] and shares[1] < 2 * unit and step * unit <= MAX_SAMPLE_TIME:
+            raise LogError(
+                f"{log.path}: column timestamp: found rows about {step:.4g} apart while the joints "
+                f"move as in {step * unit:.3g} s; the times look like {name}, expected s"
+            )
 
 
 def _within(values: Array, most: float) -> bool:

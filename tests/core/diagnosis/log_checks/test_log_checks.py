@@ -274,3 +274,32 @@ def test_a_sensor_or_a_pull_of_the_wrong_sign_is_suspected(moving, turned):
         kept[turned] = -kept[turned]
         (line,) = findings(truth.log_of(7, **kept), model, FREE)
         assert line.startswith(f"{turned} seems to have the wrong sign;")
+
+
+@pytest.mark.parametrize("unit", ["s", "milliseconds", "microseconds", "nanoseconds"])
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_times_in_fractions_of_a_second_are_refused(unit: str, start: float):
+    """Such a log counted as poses at rest, and its lag as something else."""
+    course = truth.course(MODEL.arm.n, 3)
+    t = np.arange(300) * 0.02
+    scale = {"s": 1.0, "milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}[unit]
+    log = truth.log_of(
+        MODEL.arm.n, timestamp=(t + start) * scale, actual_q=course.at(t, 0),
+        actual_qd=course.at(t, 1),
+    )  # fmt: skip
+    if unit == "s":
+        check_units(MODEL, log)
+        return
+    with pytest.raises(LogError, match=rf"timestamp: .*as in 0\.02 s; the times look like {unit}"):
+        check_units(MODEL, log)
+
+
+@pytest.mark.parametrize("pause", [1.0, 20.0, 1000.0])
+def test_rows_far_apart_are_no_other_unit_of_time(pause: float):
+    """Single readings of an arm in motion: its way in between says nothing of the speed then."""
+    course = truth.course(MODEL.arm.n, 3)
+    t = np.arange(300) * pause
+    log = truth.log_of(
+        MODEL.arm.n, timestamp=t, actual_q=course.at(t, 0), actual_qd=course.at(t, 1)
+    )
+    check_units(MODEL, log)
