@@ -46,11 +46,13 @@ class Table:
     names: tuple[str, ...]  # of the columns; empty: the file has no header
     rows: tuple[Row, ...]
 
-    def values(self, row: Row, columns: tuple[str, ...] | None, count: int) -> list[float]:
-        """Return ``count`` numbers of a row: the named columns, by default the last ones.
+    def values(self, row: Row, settings: ExportSettings) -> list[float]:
+        """Return the numbers of a row's reading: the named columns, by default the last ones.
 
-        Raises ReadingError naming file and row, InputError for an unknown column.
+        Raises ReadingError naming file and row, also for another unit than the declared one;
+        InputError for an unknown column.
         """
+        columns, count = settings.columns, settings.width
         titled = self.names and self.names[0].startswith("#")  # a comment, perhaps no header
         if self.names and len(row.cells) != len(self.names) and (columns or not titled):
             raise ReadingError(  # which of its cells it lacks is unknown: the others would shift
@@ -59,7 +61,7 @@ class Table:
             )
         cells = row.cells[-count:] if columns is None else self._select(row, columns)
         try:
-            return parse_numbers(";".join(cells), count)
+            return parse_numbers(";".join(cells), count, settings.unit)
         except ReadingError as error:
             raise ReadingError(f"{self.path}: row {row.line}: {error}") from None
 
@@ -154,8 +156,7 @@ class _ExportedReadings(Instrument[E]):
         return samples
 
     def _coordinates(self, table: Table, row: Row) -> Array:
-        settings = self.settings
-        return to_si(table.values(row, settings.columns, settings.width), settings)
+        return to_si(table.values(row, self.settings), self.settings)
 
 
 class ReadingsFile(_ExportedReadings[FileSettings]):

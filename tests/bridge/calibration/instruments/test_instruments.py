@@ -156,6 +156,7 @@ def test_a_file_with_stops_gives_each_stop_its_last_row(tmp_path: Path) -> None:
         ("x,y,z\n1,2,q\n", "row 2: found 'q'"),
         ("n,x,y,z\n1,100,200\n", "row 2: found 3 cells, expected 4 as in the header"),
         ("x,y,z\n1,5,2,5,3,5\n", "row 2: found 6 cells, expected 3"),
+        ("x,y,z\n12.5 in,3.0 in,4.0 in\n", "row 2: found in, expected m: the unit declared"),
     ],
 )
 def test_a_bad_row_is_named(tmp_path: Path, text: str, phrase: str) -> None:
