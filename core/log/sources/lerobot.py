@@ -11,6 +11,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError, LogOptionError
+from gapbridge.core.files import quoted
 from gapbridge.core.log.sources.joint_order import order_joints
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 from gapbridge.core.notes import Note, Reason
@@ -56,6 +57,11 @@ class LeRobot(Source):
         fps = _fps(path, info)
         episodes = len(np.unique(table["episode_index"]))
         notes = [Note(Reason.FRAME_TIMES, (fps, 1e3 / fps))]
+        notes += [
+            Note(Reason.MISSING, (missing, column))
+            for column in ("target_q", "actual_q")
+            if (missing := int(np.isnan(columns[column]).any(axis=1).sum()))
+        ]
         if episodes > 1:
             notes.append(Note(Reason.EPISODES, (episodes, PAUSE)))
         if options.calibration is not None:
@@ -66,7 +72,7 @@ class LeRobot(Source):
 def _info(path: Path) -> dict[str, Any]:
     try:
         found = json.loads((path / INFO).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise LogError(f"{path / INFO}: found no readable JSON ({error})") from None
     if not isinstance(found, dict) or not isinstance(found.get("features"), dict):
         raise LogError(f"{path / INFO}: features: not found, expected the dataset's columns")
@@ -88,11 +94,14 @@ def _names(path: Path, info: dict[str, Any], feature: str) -> list[str]:
 
 def _fps(path: Path, info: dict[str, Any]) -> float:
     """Return the frames per second; 30 if the dataset does not state it."""
+    given = info.get("fps", 0)
     try:
-        return float(info.get("fps", 0)) or 30.0
-    except (ValueError, TypeError):
-        found = f"found {info['fps']!r}, expected a number"
-        raise LogError(f"{path / INFO}: fps: {found} (Hz)") from None
+        fps = float(given) or 30.0
+    except (ValueError, TypeError, OverflowError):
+        fps = np.nan
+    if not 0.0 < fps < np.inf:
+        raise LogError(f"{path / INFO}: fps: found {quoted(given)}, expected a number above 0 (Hz)")
+    return fps
 
 
 def _table(path: Path, episode: int | None, widths: dict[str, int]) -> dict[str, Array]:
@@ -115,25 +124,34 @@ def _table(path: Path, episode: int | None, widths: dict[str, int]) -> dict[str,
         except (pyarrow.ArrowException, OSError) as error:
             raise LogError(f"{file}: found no readable frames ({error})") from None
         if episode is not None:
-            last = max(last, *frame["episode_index"].to_pylist())
+            known = (number for number in frame["episode_index"].to_pylist() if number is not None)
+            last = max(0, last, *known)
             frame = frame.filter(pyarrow.compute.equal(frame["episode_index"], episode))
         if frame.num_rows:
             parts.append({name: _numbers(file, frame, name, widths.get(name)) for name in wanted})
+    if not parts and episode is None:
+        raise LogError(f"{path / 'data'}: found no frames, expected at least one")
     if not parts:
         raise LogOptionError(f"{path}: --episode: found no episode {episode}, expected 0 to {last}")
     return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
 
 
 def _numbers(file: Path, frame: pyarrow.Table, name: str, width: int | None) -> Array:
-    """Return a column: (N,), or vectors (N, width). Raises LogError."""
+    """Return a column: (N,), or vectors (N, width) with NaN where one is missing.
+
+    Raises LogError for what is no number, or infinite.
+    """
     try:
         found = np.array(frame[name].to_pylist(), dtype=float)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         found = np.empty(0)
     shape = (frame.num_rows,) if width is None else (frame.num_rows, width)
     if found.shape != shape or (width is None and not np.isfinite(found).all()):
         what = "a number" if width is None else f"{width} numbers"
         raise LogError(f"{file}: column {name}: expected {what} in each of {shape[0]} rows")
+    if np.isinf(found).any():
+        row = int(np.argwhere(np.isinf(found))[0][0]) + 1
+        raise LogError(f"{file}: row {row}, column {name}: found inf, expected finite numbers")
     return found
 
 
@@ -167,7 +185,7 @@ def _scale(path: Path, order: Sequence[str], options: SourceOptions) -> Array:
         span = [float(most) - float(least) for least, most in ends.values()]
     except OSError as error:
         raise LogError(f"{file}: cannot be read ({error.strerror})") from None
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError, RecursionError):
         raise LogError(f"{file}: found no LeRobot calibration, expected JSON with range_min and "
                        "range_max of each joint") from None  # fmt: skip
     except KeyError as error:

@@ -149,6 +149,58 @@ def test_frames_and_rates_that_are_no_numbers_are_refused(dataset: Path) -> None
             source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad"))
     parquet.write_table(whole, file)
     info = dataset / "meta" / "info.json"
-    info.write_text(json.dumps(json.loads(info.read_text()) | {"fps": "x"}))
-    with pytest.raises(LogError, match="fps: found 'x', expected a number"):
+    for fps, found in (("x", "'x'"), (float("nan"), "nan"), (float("inf"), "inf"), (-30, "-30"),
+                       (10**400, "10+")):  # fmt: skip
+        info.write_text(json.dumps(json.loads(info.read_text()) | {"fps": fps}))
+        with pytest.raises(LogError, match=f"fps: found {found}.*, expected a number above 0"):
+            source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad"))
+
+
+def with_actions(dataset: Path, row: int, value: float | None) -> None:
+    """Replace the numbers of one frame's action."""
+    file = dataset / "data" / "chunk-000" / "file-000.parquet"
+    whole = parquet.read_table(file)
+    actions = whole["action"].to_pylist()
+    actions[row] = [value] * len(NAMES)
+    position = whole.column_names.index("action")
+    parquet.write_table(whole.set_column(position, "action", pyarrow.array(actions)), file)
+
+
+def test_infinite_numbers_are_refused_and_missing_ones_noted(dataset: Path) -> None:
+    options = SourceOptions(units="rad")
+    with_actions(dataset, 5, None)
+    with_actions(dataset, 40, float("nan"))
+    found = source_of(dataset).read(dataset, JOINTS, options)
+    assert np.flatnonzero(np.isnan(found.columns["target_q"]).any(axis=1)).tolist() == [5, 40]
+    assert "2 rows without a value of target_q" in note_texts(found.notes)
+    with_actions(dataset, 6, -np.inf)
+    with pytest.raises(LogError, match="row 7, column action: found inf, expected finite"):
+        source_of(dataset).read(dataset, JOINTS, options)
+
+
+def test_a_chunk_without_frames_is_left_out(dataset: Path) -> None:
+    """So is an episode that is being recorded."""
+    whole = parquet.read_table(dataset / "data" / "chunk-000" / "file-000.parquet")
+    parquet.write_table(whole[:0], dataset / "data" / "chunk-000" / "file-001.parquet")
+    found = source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad", episode=1))
+    assert len(found.columns["timestamp"]) == FRAMES
+    with pytest.raises(LogError, match="found no episode 7, expected 0 to 1"):
+        source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad", episode=7))
+    parquet.write_table(whole[:0], dataset / "data" / "chunk-000" / "file-000.parquet")
+    with pytest.raises(LogError, match="data: found no frames, expected at least one"):
+        source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad"))
+
+
+def test_json_that_python_cannot_take_is_refused(dataset: Path, tmp_path: Path) -> None:
+    deep = "[" * 200_000 + "]" * 200_000
+    (tmp_path / "deep.json").write_text(deep)
+    options = SourceOptions(calibration=tmp_path / "deep.json")
+    with pytest.raises(LogError, match=r"deep\.json: found no LeRobot calibration"):
+        source_of(dataset).read(dataset, JOINTS, options)
+    huge = {name: {"range_min": 0, "range_max": 10**400} for name in RANGE}
+    (tmp_path / "deep.json").write_text(json.dumps(huge))
+    with pytest.raises(LogError, match=r"deep\.json: found no LeRobot calibration"):
+        source_of(dataset).read(dataset, JOINTS, options)
+    (dataset / "meta" / "info.json").write_text(deep)
+    with pytest.raises(LogError, match=r"info\.json: found no readable JSON"):
         source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad"))
