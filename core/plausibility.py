@@ -6,6 +6,7 @@ arm: such values are errors. Values that few arms have are warnings.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -42,6 +43,7 @@ class Implausible:
     where: str = ""
 
 
+@np.errstate(all="ignore")  # what overflows is refused as implausible, without numpy's warnings
 def reach(arm: Arm, seed: int = 0) -> float:
     """Return the largest distance (m) of the flange from joint 1, over random poses.
 
@@ -77,7 +79,7 @@ def implausible_in_arm(arm: Arm, keys: tuple[str | int, ...]) -> Iterator[Implau
             yield Implausible(keys, f"{mass:.4g} kg of link {i + 1}", "kg, 0 or more (grams?)")
         elif mass > LARGE_MASS:
             yield Implausible(keys, f"{mass:.4g} kg of link {i + 1}", "at most 500 kg", sure=False)
-        distance = float(np.linalg.norm(arm.cog[i])) if mass > 0 else 0.0
+        distance = math.hypot(*arm.cog[i]) if mass > 0 else 0.0
         if reach_m <= MAX_REACH and distance > 2.0 * reach_m + 1.0:
             yield Implausible(
                 keys, f"a centre of gravity of link {i + 1} {distance:.4g} m off", "m (mm?)"

@@ -36,6 +36,7 @@ class _Body:
 NO_BODY = _Body(0.0, np.zeros(3), np.zeros((3, 3)))
 
 
+@np.errstate(all="ignore")  # what overflows is refused as implausible, without numpy's warnings
 def arm_from_urdf(path: Path | str, tip: str | None = None) -> Arm:
     """Return the arm of a URDF file, from its root link to ``tip`` (default: the last link).
 

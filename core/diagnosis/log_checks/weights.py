@@ -44,6 +44,8 @@ def weight_findings(model: Model, log: Log) -> list[LogFinding]:
     rows = _rows(q, torque, speed)
     if speed is None or len(rows) < MIN_ROWS:
         return []
+    if (torque[rows] == torque[rows[0]]).all():  # the controller gives none
+        return []
     weights = _weights(model, log, q, rows)
     if np.sqrt(np.mean((weights @ model.gravity) ** 2, axis=0)).max() < MIN_TORQUE:
         return []

@@ -130,8 +130,10 @@ def test_an_unusual_value_is_a_warning(tmp_path: Path, text: str, phrase: str) -
         ({"mass": "7369"}, "found 7369 kg of link 1"),
         ({"mass": "4000"}, "m reach, expected kg (grams?)"),
         ({"mass": '4"/><inertia ixx="1e9'}, "found 1e+09 kg m2, inertia of link 1, expected kg m2"),
+        ({"xyz": "0 1e300 0"}, "line 6: joint 'j2': found origin xyz 1e+300"),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_a_urdf_in_other_units_is_refused_with_its_line_too(
     tmp_path: Path, changed: dict[str, str], phrase: str
 ) -> None:

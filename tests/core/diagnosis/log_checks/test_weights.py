@@ -52,6 +52,16 @@ def test_another_mounting_is_reported_with_the_direction_of_the_weights(moving, 
     assert along @ UPRIGHT > 0.97 * G * np.linalg.norm(along)  # the motion's own forces are in it
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [0.0, 3.0])
+def test_torques_that_never_change_show_no_mounting(moving, value):
+    """A recorder writes zeros where a controller gives nothing: no direction has no length."""
+    model, columns = moving
+    same = np.full_like(columns["actual_q"], value)
+    log = truth.log_of(7, **{**columns, "actual_current_as_torque": same})
+    assert not [line for line in reported(model, log, UPRIGHT) if "weights" in line]
+
+
 def test_torques_of_the_wrong_sign_are_no_ceiling(moving):
     model, columns = moving
     turned = columns | {"actual_current_as_torque": -columns["actual_current_as_torque"]}
