@@ -36,6 +36,7 @@ _FLOAT = re.compile(
     r"|[-+]?\.[0-9][0-9_]*(?:[eE][-+]?[0-9]+)?"
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
 )
+_NO_CHARACTER = re.compile("[\0\ud800-\udfff]")
 _BOOLEAN = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
 YAML_11_BOOLEAN = "tag:yaml.org,2002:bool"
 _NUMBERS = {"tag:yaml.org,2002:int": _INTEGER, "tag:yaml.org,2002:float": _FLOAT}
@@ -208,7 +209,7 @@ def parse_yaml(text: str, path: Path, kind: Kind) -> Document:
             content = "an empty file" if root is None else "no keys"
             raise kind.error(f"{where}: found {content}, expected a {kind.name} ({kind.keys})")
         _require_plain(root, path, kind, set())
-        data = loader.construct_document(root)
+        data = _constructed(loader, root, path, kind)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1
@@ -224,6 +225,43 @@ def parse_yaml(text: str, path: Path, kind: Kind) -> Document:
         what = " ".join(str(error).split())
         raise kind.error(f"{path}: found broken YAML: {what}") from None
     return Document(path, text, root, data)
+
+
+def _constructed(loader: Any, root: yaml.Node, path: Path, kind: Kind) -> Any:
+    """Return the data of a document; raises the kind's error for a value that is not of its type.
+
+    As a date with a 13th month, or a text with a tag of numbers; PyYAML has no error of its own
+    for these.
+    """
+    try:
+        return loader.construct_document(root)
+    except (ValueError, LookupError, AttributeError, TypeError):
+        anew = kind.loaders[-1]("")  # the first one stands in the middle of its work
+        for node in _scalars(root, set()):
+            try:
+                anew.construct_object(node)
+            except (ValueError, LookupError, AttributeError, TypeError):
+                line, what = node.start_mark.line + 1, node.tag.rsplit(":", 1)[-1]
+                raise kind.error(
+                    f"{path}, line {line}: found {quoted(node.value)}, expected a valid {what}"
+                ) from None
+        raise
+
+
+def _scalars(node: Any, seen: set[int]) -> Iterator[yaml.ScalarNode]:
+    """Yield the scalars below a node, of which aliases may hold some several times."""
+    if id(node) in seen:
+        return
+    seen.add(id(node))
+    if isinstance(node, yaml.ScalarNode):
+        yield node
+    elif isinstance(node, yaml.MappingNode):
+        for pair in node.value:
+            for part in pair:
+                yield from _scalars(part, seen)
+    else:
+        for item in node.value:
+            yield from _scalars(item, seen)
 
 
 def _load(text: str, kind: Kind) -> tuple[Any, yaml.Node | None]:
@@ -256,14 +294,18 @@ def read_yaml(path: Path, kind: Kind) -> Document:
 def _require_plain(node: yaml.Node, path: Path, kind: Kind, seen: set[int]) -> None:
     """Raise the kind's error for a key that comes twice, and for what no value can have.
 
-    That is NUL, which no path may have, a decimal comma, and digits without an end.
+    That is NUL, which no path may have, half of a surrogate pair, which is no character, a decimal
+    comma, and digits without an end.
     """
     if id(node) in seen:
         return
     seen.add(id(node))
-    if isinstance(node, yaml.ScalarNode) and "\0" in node.value:
+    if isinstance(node, yaml.ScalarNode) and (found := _NO_CHARACTER.search(node.value)):
         line = node.start_mark.line + 1
-        raise kind.error(f"{path}, line {line}: found {quoted(node.value)}, expected no \\0 in it")
+        what = "\\0" if found[0] == "\0" else ascii(found[0])[1:-1]
+        raise kind.error(
+            f"{path}, line {line}: found {quoted(node.value)}, expected no {what} in it"
+        )
     if node.tag == "tag:yaml.org,2002:int" and len(node.value) > MAX_DIGITS:
         line = node.start_mark.line + 1
         raise kind.error(f"{path}, line {line}: found {quoted(node.value)}, expected fewer digits")

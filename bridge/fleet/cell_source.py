@@ -125,6 +125,11 @@ def _table(path: Path) -> CellTable:
                         f"{path}: row {rows.line_num}: found no {'cell' if arm else 'arm'}, "
                         "expected both"
                     )
+                if "\0" in arm + cell:
+                    raise InputError(
+                        f"{path}: row {rows.line_num}: found {arm + ',' + cell!r}, expected no \\0 "
+                        "in it"
+                    )
                 if arm in cells:
                     raise InputError(
                         f"{path}: row {rows.line_num}: found arm {arm!r} twice, expected once"

@@ -88,6 +88,7 @@ class Journal:
 def _outcome(line: bytes) -> Outcome | None:
     try:
         fields: dict[str, Any] = from_json(line)
-        return Outcome(**fields)
+        outcome = Outcome(**fields)
     except (ValueError, TypeError):
         return None
+    return outcome if isinstance(outcome.key, str) else None

@@ -84,6 +84,9 @@ class Scene:
         require_utf8(path)
         self.path = path
         self.mujoco = mujoco
+        # MuJoCo's own handler writes MUJOCO_LOG.TXT into the folder in which the user is
+        warnings: list[str] = []
+        mujoco.set_mju_user_warning(warnings.append)
         try:
             self.spec: Any = mujoco.MjSpec.from_file(str(path))
             self._name_bodies()
@@ -91,6 +94,9 @@ class Scene:
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
             raise InputError(f"{path}: found no MJCF that compiles ({text})") from None
+        finally:
+            mujoco.set_mju_user_warning(None)
+        self._require_finite(warnings)
         self.data: Any = mujoco.MjData(self.compiled)
         for j in range(self.compiled.njnt):  # angle zero, whatever the joint's ref
             self.data.qpos[self.compiled.jnt_qposadr[j]] = 0
@@ -102,6 +108,18 @@ class Scene:
         self._before: dict[str, tuple[str, list[Hinge]]] = {}  # by body: the body inserted before
         self._explicit: set[int] = set()  # ids of bodies
         self._tendons: list[tuple[str, str, float, float]] = []
+
+    def _require_finite(self, warnings: Sequence[str]) -> None:
+        """Raise InputError for a NaN in the file, or a body that is at no place."""
+        for body, placed in enumerate(np.isfinite(self.compiled.body_pos).all(axis=1)):
+            if not placed:
+                name = self.compiled.body(body).name
+                found = " ".join(f"{x:g}" for x in self.compiled.body_pos[body])
+                raise InputError(
+                    f"{self.path}: body {name!r}: pos: found {found}, expected finite numbers"
+                )
+        if nans := [text for text in warnings if "NaN" in text]:
+            raise InputError(f"{self.path}: found NaN, expected finite numbers ({nans[0]})")
 
     def _name_bodies(self) -> None:
         """Name the bodies of named joints, to be found in the XML; others can stay unnamed."""

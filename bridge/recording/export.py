@@ -77,7 +77,7 @@ def moment(text: str) -> float | datetime:
             return seconds
     try:
         return datetime.fromisoformat(text).astimezone()
-    except ValueError:
+    except (ValueError, OverflowError):  # 9999-12-31 is beyond the last day in the west
         raise InputError(
             f"found {text!r}, expected seconds from the beginning (negative: before the end) or a "
             "time like 2026-01-31T14:05:00"

@@ -40,7 +40,7 @@ def _plain(pair: str, value: str) -> Any:
     """Return a value of the command line. Raises InputError."""
     try:
         return yaml.safe_load(value)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError):  # !!int of a text
         expected = "expected KEY=VALUE in YAML (signs in quotes)"
         raise InputError(f"--instrument: found {pair!r}, {expected}") from None
 

@@ -206,6 +206,11 @@ def test_end_of_input_and_quit_show_how_to_resume(tmp_path: Path) -> None:
         (["--instrument", "typed,kind=file"], {}, "--instrument: found kind twice"),
         (["--instrument", "file,unit=mm,columns=[x,y],file=none/x.csv"], {}, "no such file"),
         (["--instrument", "typed,unit=["], {}, "--instrument: found 'unit=[', expected KEY=VALUE"),
+        (
+            ["--instrument", "typed,unit=!!int a"],
+            {},
+            "--instrument: found 'unit=!!int a', expected KEY",
+        ),
         (["--instrument", "typed,unit=mm,unit=m"], {}, "--instrument: found unit twice"),
         (["--move"], {}, "calibration.joints: found 'planned' with --move, expected 'link'"),
         (["--verify"], {}, "expected the accuracy baseline that `gapbridge calibrate` writes"),

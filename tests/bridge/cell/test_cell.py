@@ -313,6 +313,15 @@ def test_a_whole_number_may_be_a_float_and_a_float_whole(tmp_path: Path) -> None
         (ARM + f"payload: {{mass: {'9' * 5000}}}", "line 2: found '9999"),
         (f"robot: {'[' * 3000}", "found values nested too deep, expected a few levels"),
         (ARM + 'setpoints: {file: "a\\0b"}', "line 2: found 'a\\x00b', expected no \\0 in it"),
+        (
+            ARM + 'setpoints: {file: "\\ud800"}',
+            "line 2: found '\\ud800', expected no \\ud800 in it",
+        ),
+        (ARM + "payload: {mass: !!int ''}", "line 2: found '', expected a valid int"),
+        (ARM + "payload: {mass: !!float abc}", "line 2: found 'abc', expected a valid float"),
+        (ARM + "payload: {mass: !!bool maybe}", "line 2: found 'maybe', expected a valid bool"),
+        (ARM + "payload: {mass: !!timestamp abc}", "line 2: found 'abc', expected a valid times"),
+        (ARM + "payload: {mass: 2026-13-41}", "line 2: found '2026-13-41', expected a valid times"),
     ],
 )
 def test_broken_yaml_is_reported_with_its_line(tmp_path: Path, text: str, phrase: str) -> None:

@@ -56,6 +56,18 @@ def test_a_line_that_was_cut_off_is_taken_away_and_the_rest_kept(tmp_path: Path)
     assert path.read_bytes() == whole
 
 
+def test_a_line_whose_key_is_no_text_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    with Journal(path, clock=SYSTEM) as journal:
+        journal.add(outcome("a"))
+        journal.add(outcome("b"))
+    path.write_bytes(path.read_bytes().replace(b'"key":"a"', b'"key":["a"]'))
+    assert b'["a"]' in path.read_bytes()
+    with Journal(path, clock=SYSTEM) as journal:
+        assert journal.known("a") is None
+        assert journal.known("b") == outcome("b")
+
+
 def test_two_runs_do_not_write_one_journal(tmp_path: Path) -> None:
     path = tmp_path / "j.jsonl"
     with Journal(path, clock=SYSTEM), pytest.raises(RunError, match="another run writes it"):

@@ -152,6 +152,7 @@ def test_a_table_maps_arms_to_cells_seen_from_its_folder(tmp_path: Path) -> None
         ("arm;cell\n", "header: found arm;cell, expected columns arm and cell"),
         ("arm,cell\na,x\na,y\n", "row 3: found arm 'a' twice"),
         ("arm,cell\na,\n", "row 2: found no cell"),
+        ("arm,cell\na,x\0.yaml\n", "row 2: found 'a,x\\x00.yaml', expected no \\0 in it"),
     ],
 )
 def test_a_table_that_cannot_be_used_is_reported(text: str, reported: str, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from benchmarks.patch.arms import BASE_TURN, UR_JOINTS, mjcf, numbers, urdf
 from gapbridge.bridge.patch import Patched, PatchOptions, changes_of, format_of
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import Site, Term
+from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
 
 mujoco = pytest.importorskip("mujoco")
@@ -32,6 +33,23 @@ Q = np.array([0.3, -0.9, 1.2, -0.4, 0.7, 0.2])
 def patched(path: Path, text: str, model: Model, options: PatchOptions) -> Patched:
     path.write_text(text)
     return format_of(path).patch(path, changes_of(model), options, [])
+
+
+@pytest.mark.parametrize(
+    ("changed", "phrase"),
+    [
+        (r'\1pos="nan 0 0"', "pos: found nan 0 0, expected finite numbers"),
+        (r'\1pos="inf 0 0"', "pos: found inf 0 0, expected finite numbers"),
+    ],
+)
+def test_a_body_at_no_place_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str, phrase: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = re.sub(r'(<body name="[^"]*" )pos="[^"]*"', changed, mjcf(ARM, UR_JOINTS), count=1)
+    with pytest.raises(InputError, match=rf"arm\.xml: body '\w+': {phrase}"):
+        patched(tmp_path / "arm.xml", text, OFFSET, PatchOptions())
+    assert [path.name for path in tmp_path.iterdir()] == ["arm.xml"]  # no MUJOCO_LOG.TXT
 
 
 def with_refs(text: str, ref: float) -> str:
