@@ -316,7 +316,7 @@ def _require_plain(node: yaml.Node, path: Path, kind: Kind, seen: set[int]) -> N
         keys: set[str] = set()
         _require_decimal_points(node, path, kind)
         for key, value in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
+            if isinstance(key, yaml.ScalarNode):
                 if key.value in keys:
                     line = key.start_mark.line + 1
                     raise kind.error(

@@ -25,7 +25,8 @@ DEFAULT_DRIVER = "ur_rtde"
 def _driver_of(link: Any) -> Any:
     """Return the name of the driver in a link's keys or settings."""
     if isinstance(link, dict):
-        return link.get("driver", DEFAULT_DRIVER)
+        name = link.get("driver", DEFAULT_DRIVER)
+        return "" if name is None else str(name)  # a value forgotten is no driver either
     return getattr(link, "driver", DEFAULT_DRIVER)
 
 

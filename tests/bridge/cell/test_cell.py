@@ -304,6 +304,12 @@ def test_a_whole_number_may_be_a_float_and_a_float_whole(tmp_path: Path) -> None
         ("robot: [1, 2", "line 1"),
         (ARM + "tool:\n\txyz: 1", "line 3"),
         (ARM + "tool: {}\nrobot: 5", "line 3: robot: found twice"),
+        (ARM + "payload: {<<: {mass: 1}, <<: {mass: 2}}", "line 2: <<: found twice"),
+        (
+            ARM + "link: {driver: }",
+            "line 2: link.driver: found '', expected one of 'ur_rtde', 'mod",
+        ),
+        (ARM + "link: {driver: [a]}", "line 2: link.driver: found \"['a']\", expected one of 'ur_"),
         ("", "empty"),
         ("just words", "no keys"),
         ("robot: !!python/object:os.system []", "line 1"),
