@@ -16,7 +16,7 @@ POWER_OFF, IDLE, RUNNING = 3, 5, 7  # robot_mode
 NORMAL, REDUCED, PROTECTIVE_STOP, EMERGENCY_STOP, FAULT = 1, 2, 3, 7, 9  # safety_mode
 STOPPED = 1 << 10
 STOPS = 0b111_1111_1100  # safety_status_bits: all but normal and reduced mode
-PROGRAM_STOPPED, PLAYING, PAUSED = 1, 2, 4  # runtime_state
+PROGRAM_STOPPING, PROGRAM_STOPPED, PLAYING, PAUSED = 0, 1, 2, 4  # runtime_state
 
 
 class StopReason(StrEnum):

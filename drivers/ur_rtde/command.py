@@ -21,7 +21,13 @@ import numpy as np
 from gapbridge.core.errors import WriteError, first_line
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import Clock
-from gapbridge.drivers.robot_modes import PAUSED, PLAYING, PROGRAM_STOPPED, why_not_ready
+from gapbridge.drivers.robot_modes import (
+    PAUSED,
+    PLAYING,
+    PROGRAM_STOPPED,
+    PROGRAM_STOPPING,
+    why_not_ready,
+)
 from gapbridge.drivers.ur_rtde import registers
 from gapbridge.drivers.ur_rtde.registers import Program
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
@@ -30,6 +36,7 @@ NO_REMOTE_CHECK = 0x80  # FLAG_DISABLE_REMOTE_CONTROL_CHECK
 KICK = 0.02  # s between kicks of the watchdog
 FOLLOWING = 0.02  # rad: largest distance of the controller's target from recent setpoints
 ECHO_SAMPLES, ANNOUNCE_TIMEOUT = 8, 0.3  # samples per attempt and s for all, until the first echo
+LONGEST_STOPPING = 1.0  # s that a program takes to stop, as our own does after a release
 DECIMATION, KEPT = 5, 64  # every so many setpoints one is stored; how many are stored
 DESCRIPTORS = Path("/proc/self/fd")  # the open sockets of this process
 CONTROL = (
@@ -77,7 +84,10 @@ class ServoWriter:
     def arm(self, state: RobotState, look: Look) -> None:
         """Upload the control script and start the robot's watchdog. Raises WriteError."""
         host = self._settings.host
+        until = self._now() + LONGEST_STOPPING
         state = look() or state  # the controller was compared with the cell since, for seconds
+        while state.runtime_state == PROGRAM_STOPPING and self._now() < until:
+            state = look() or state
         check_ready(host, state)
         if state.runtime_state != PROGRAM_STOPPED:
             number = state.runtime_state

@@ -200,8 +200,20 @@ def test_a_program_that_is_not_stopped_is_not_ended_by_arming(
 ) -> None:
     servo = Servo()
     with pytest.raises(WriteError, match=f"found a program {named}"):
-        servo.arm(state(runtime_state=runtime_state), lambda: None)
+        servo.arm(state(runtime_state=runtime_state), lambda: servo.clock.sleep(CYCLE))
     assert not servo.library.calls
+
+
+def test_a_program_that_is_about_to_stop_is_waited_for() -> None:
+    servo, coming = Servo(), [*[0] * 20, STOPPED]
+
+    def look() -> RobotState:
+        servo.clock.sleep(CYCLE)
+        return state(runtime_state=coming.pop(0))
+
+    servo.arm(state(runtime_state=PLAYING), look)
+    assert not coming
+    assert servo.library.calls[0] == ("opened",)
 
 
 def test_a_program_started_after_the_judged_sample_is_not_ended_by_arming() -> None:
