@@ -23,6 +23,7 @@ from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.gate import GateBounds
 
 DECELERATION = 8.0  # rad/s^2 of the fastest joint
+LEAST_ROOM = 1e-9  # rad to a joint limit, of which a quotient is taken
 SMOOTHING = 0.02  # s: over which the velocity is averaged
 POSITION, RATE, LIMIT = range(3)  # rows of NominalStream's array
 PEAK_SLOPE = 1.5  # of a smooth step, in units of its mean slope
@@ -122,12 +123,8 @@ class NominalStream:
         """Return that of the fastest joint with which each stops before its limit, rad/s^2."""
         rate = self._rate
         room = np.where(rate > 0.0, self._upper - self.q, self.q - self._lower)
-        moves = rate != 0.0
-        if (room[moves] <= 0.0).any():
-            return np.inf
-        return float(
-            np.max(0.5 * fastest * np.abs(rate[moves]) / room[moves], initial=DECELERATION)
-        )
+        needed = 0.5 * fastest * np.abs(rate) / np.maximum(room, LEAST_ROOM)
+        return float(np.max(needed, initial=DECELERATION))
 
     def keep(self) -> None:
         """Remember the present motion for ``take_back``."""
