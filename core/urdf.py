@@ -281,6 +281,8 @@ def numbers_of(element: ElementTree.Element | None, key: str, default: str, labe
     """
     text = default if element is None else str(element.get(key, default))
     try:
+        if "_" in text:  # Python reads 1_0 as 10
+            raise ValueError
         values = np.array([float(v) for v in text.split()])
     except ValueError:
         values = np.array([])

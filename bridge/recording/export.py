@@ -73,7 +73,7 @@ def moment(text: str) -> float | datetime:
     Raises InputError if it is neither.
     """
     with contextlib.suppress(ValueError):
-        if abs(seconds := float(text)) < LONGEST:
+        if "_" not in text and abs(seconds := float(text)) < LONGEST:  # Python reads 1_0 as 10
             return seconds
     try:
         return datetime.fromisoformat(text).astimezone()
