@@ -25,7 +25,7 @@ from gapbridge.drivers.clock import SYSTEM
 
 INTERRUPT_RETRY = 0.02  # s until an interrupt inside LLVM is tried again
 SUCCESS, FAILURE, UNUSABLE_INPUT = 0, 1, 2
-INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # as a shell has it
+BY_SIGNAL = 128  # and its number, as a shell has it
 UNUSABLE_PATH = (errno.EACCES, errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP)
 
 
@@ -145,8 +145,10 @@ def _run(arguments: list[str]) -> int:
     except click.ClickException as error:
         return _fail(error.format_message(), UNUSABLE_INPUT)
     except (KeyboardInterrupt, click.Abort) as error:
-        ended = isinstance(error.__cause__ or error, Terminated)  # click wraps it
-        return _fail("terminated", TERMINATED) if ended else _fail("interrupted", INTERRUPTED)
+        cause = error.__cause__ or error  # click wraps it
+        if isinstance(cause, Terminated):
+            return _fail("terminated", BY_SIGNAL + cause.number)
+        return _fail("interrupted", BY_SIGNAL + signal.SIGINT)
     except GapbridgeError as error:
         return _fail(str(error), error.exit_code)
     except OSError as error:
@@ -200,21 +202,25 @@ def _crash(error: Exception) -> int:
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM: ends a command as Ctrl-C does, so that it removes what is half written."""
+    """SIGTERM or SIGHUP: ends a command as Ctrl-C does, so that it removes what is half written."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
 
 
 @contextlib.contextmanager
 def _handled_signals(arguments: list[str]) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM end the command, but never inside LLVM; an ignored one stays ignored.
+    """Let Ctrl-C, SIGTERM and SIGHUP (a closed terminal) end the command, but never inside LLVM.
 
     LLVM calls Python back while it loads a function. An exception there is printed and lost, or the
     half-loaded code crashes the process, which leaves an incomplete file. Commands of a robot keep
-    their own SIGTERM.
+    their own SIGTERM and SIGHUP. An ignored signal stays ignored.
     """
     command = COMMANDS.get(arguments[0]) if arguments else None
     handled: dict[int, Any] = {signal.SIGINT: signal.default_int_handler}
     if command is None or not command[0].startswith(ROBOT):
-        handled[signal.SIGTERM] = signal.SIG_DFL
+        handled |= {signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
     if threading.current_thread() is not threading.main_thread():
         handled = {}
     handled = {n: default for n, default in handled.items() if signal.getsignal(n) is default}
@@ -229,7 +235,7 @@ def _handled_signals(arguments: list[str]) -> Iterator[None]:
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
     if not _in_llvm(frame):
-        raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
+        raise KeyboardInterrupt if number == signal.SIGINT else Terminated(number)
     retry = threading.Timer(INTERRUPT_RETRY, os.kill, (os.getpid(), number))
     retry.daemon = True
     retry.start()

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from cli_runs import cell_in, gapbridge, refused
+from cli_runs import Answer, cell_in, gapbridge, refused
 
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cli.log.blind import benchmark
@@ -61,38 +61,60 @@ def test_an_interrupt_ends_without_a_traceback(
 
 
 @pytest.fixture
-def default_sigterm() -> Iterator[None]:
-    """The handler of a fresh process: another command may have left its own."""
-    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+def default_signals() -> Iterator[None]:
+    """The handlers of a fresh process: another command may have left its own."""
+    before = {n: signal.signal(n, signal.SIG_DFL) for n in (signal.SIGTERM, signal.SIGHUP)}
     yield
-    signal.signal(signal.SIGTERM, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
-@pytest.mark.usefixtures("default_sigterm")
-def test_sigterm_ends_a_command_as_an_interrupt_does_and_leaves_no_partial_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def interrupted_patch(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> Answer:
+    """Run ``gapbridge patch``, to which the signal comes while it writes its output."""
+
     def write(path: Path, *_: object) -> None:
         with replacing(path) as file:
             file.write("half")
-            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(number)
 
     monkeypatch.setattr("gapbridge.bridge.cli.cell.patch.write_text", write)
-    model, cell = tmp_path / "arm.urdf", tmp_path / "cell.yaml"
+    model, cell = folder / "arm.urdf", folder / "cell.yaml"
     shutil.copy(Path(__file__).parents[3] / "config" / "piper.urdf", model)
     cell.write_text("robot: {urdf: arm.urdf, tip: link6}\n", encoding="utf-8")
-    answer = gapbridge("patch", model, "--cell", cell, "--out", tmp_path / "new.urdf")
-    assert (answer.code, answer.err.strip()) == (143, "error: terminated")
-    assert sorted(tmp_path.iterdir()) == [model, cell]
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    return gapbridge("patch", model, "--cell", cell, "--out", folder / "new.urdf")
 
 
-@pytest.mark.usefixtures("default_sigterm")
-def test_the_daemon_keeps_its_own_sigterm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_sigterm_and_a_closed_terminal_end_a_command_and_leave_no_partial_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, code: int
+) -> None:
+    answer = interrupted_patch(tmp_path, monkeypatch, number)
+    assert (answer.code, answer.err.strip()) == (code, "error: terminated")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["arm.urdf", "cell.yaml"]
+    assert signal.getsignal(number) is signal.SIG_DFL
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_a_sighup_that_is_ignored_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``nohup gapbridge ...`` goes on behind a closed terminal."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    answer = interrupted_patch(tmp_path, monkeypatch, signal.SIGHUP)
+    assert (answer.code, answer.err) == (0, "")
+    assert (tmp_path / "new.urdf").read_text() == "half"
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_the_daemon_keeps_its_own_signals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[object] = []
-    daemon(monkeypatch, lambda cell, **_: seen.append(signal.getsignal(signal.SIGTERM)))
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    daemon(monkeypatch, lambda cell, **_: seen.extend(map(signal.getsignal, numbers)))
     assert gapbridge("run", cell_in(tmp_path)).code == 0
-    assert seen == [signal.SIG_DFL]
+    assert seen == [signal.SIG_DFL, signal.SIG_DFL]
 
 
 LOADING = """
