@@ -277,8 +277,13 @@ def _load(text: str, kind: Kind) -> tuple[Any, yaml.Node | None]:
 
 
 def read_yaml(path: Path, kind: Kind) -> Document:
-    """Return the document of a YAML file; raises the kind's error where it cannot be read."""
+    """Return the document of a YAML file; raises the kind's error where it cannot be read.
+
+    A device is refused, since some never end; a pipe is read.
+    """
     try:
+        if not is_given() and (path.is_char_device() or path.is_block_device()):
+            raise kind.error(f"{path}: found a device, expected {kind.file} (YAML)")
         text = read_text(path, "utf-8-sig")
     except FileNotFoundError:
         raise kind.error(f"{path}: file not found, expected {kind.file} (YAML)") from None

@@ -40,7 +40,7 @@ def order_joints(
         return numbered
     expected = f"those of the arm ({', '.join(arm_joints)})" if arm_joints else "a known order"
     raise LogOptionError(
-        f"{path}: joints: found {', '.join(found)}, expected {expected}; "
+        f"{path}: joints: found {', '.join(found) or 'none'}, expected {expected}; "
         "name them in the order of the arm's joints with --joints"
     )
 

@@ -343,6 +343,7 @@ def test_a_missing_file_a_folder_and_bytes_are_reported(tmp_path: Path) -> None:
         (tmp_path / "none.yaml", "file not found"),
         (tmp_path, "found a folder"),
         (tmp_path / "bytes.yaml", "no text"),
+        (Path("/dev/null"), "/dev/null: found a device, expected a cell file"),
     ):
         with pytest.raises(CellError, match=phrase):
             load_cell(path)

@@ -329,6 +329,8 @@ def test_an_arm_alone_says_its_order_beside_its_gripper() -> None:
     second = [f"other_joint{i}" for i in range(1, 7)]
     with pytest.raises(LogError, match="--joints"):
         order_joints(path, [*panda, *second], (), ())
+    with pytest.raises(LogError, match="joints: found none, expected a known order"):
+        order_joints(path, [], (), ())
 
 
 def test_two_arms_in_one_bag_have_to_be_chosen_between() -> None:
