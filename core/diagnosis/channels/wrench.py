@@ -38,17 +38,19 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
 
     Torques are weighted by the ratio of the noise of forces to that of torques. Rows without
     derivatives and rows whose wrench is not finite are left out. Of more than 30,000 poses at rest
-    30,000 are taken. Not observable if the readings are constant: a sensor that is not there; a
-    session in which they are is left out. Raises LogError if the log holds something unusable.
+    30,000 are taken. Not observable if the readings are constant while the joints move: a sensor
+    that is not there; a session in which they are is left out. Raises LogError if the log holds
+    something unusable.
     """
     measured = log.get("ft_raw_wrench")
     needs = [] if measured is not None else ["ft_raw_wrench"]
-    if not (log.has("actual_q") or log.has("target_q")):
+    joints = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
+    if joints is None:
         needs.append("actual_q")
-    if measured is None or needs:
+    if measured is None or joints is None:
         return NotObservable("wrench", tuple(needs))
     whole = motion_of(log)
-    still = unchanging(log, measured)
+    still = unchanging(log, measured) & ~unchanging(log, joints)
     measured = np.where(still[:, None], np.nan, measured)
     rows = subsampled(log, whole.valid & np.isfinite(measured[whole.rows]).all(axis=1), whole)
     if not len(rows):

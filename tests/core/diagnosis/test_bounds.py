@@ -57,7 +57,7 @@ def test_the_true_payload_is_from_nothing_to_three_times_the_rated(channel, decl
     log = small.log_of(
         session, np.zeros((rows, 3)) + session.q, payload=mass, payload_cog=None,
         actual_current_as_torque=np.random.default_rng(0).normal(size=(rows, 3)),
-        ft_raw_wrench=np.zeros((rows, 6)),
+        ft_raw_wrench=np.random.default_rng(1).normal(size=(rows, 6)),
     )  # fmt: skip
     model = replace(small.model_of(), payload_mass=cell)  # rated for 10 kg
     seen = channel.observe(model, log, Metrology(registered=True))
