@@ -26,7 +26,7 @@ SCALE = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "N": (1.0, "N"), "Nm": (1.0, "N
 @click.option("--carried/--no-carried", default=True, help="Also carry answers to later logs.")
 @click.option("--command", default="gapbridge", show_default=True, help="The program to judge.")
 @click.option("--draw", type=int, default=0, show_default=True,
-              help="Seed of the poses that are judged; of a recording it is its end.")  # fmt: skip
+              help="Seed of the judged poses; of a recording: its fifth from the end.")  # fmt: skip
 @click.option("--poses", type=click.IntRange(5), default=None,
               help="Fit so many random poses, and judge others.")  # fmt: skip
 @click.option("--stand-ins", "stand_ins", is_flag=True,

@@ -147,9 +147,10 @@ def copy_cell(source: Path, folder: Path) -> Path:
 
 
 def halves(table: Table, seed: int = 0, poses: int | None = None) -> tuple[Mask, Mask]:
-    """Return the rows to fit (four fifths) and to judge: the end of a recording, else at random.
+    """Return the rows to fit (four fifths) and to judge: a fifth of a recording, else at random.
 
-    With ``poses`` so many poses are fitted, and at most MOST_JUDGED of the others are judged.
+    Of a recording it is the last fifth, with ``seed`` 1 the one before, and so on. With ``poses``
+    so many poses are fitted, and at most MOST_JUDGED of the others are judged.
     """
     count = len(table)
     judged = np.zeros(count, dtype=bool)
@@ -160,7 +161,8 @@ def halves(table: Table, seed: int = 0, poses: int | None = None) -> tuple[Mask,
         judged[order[poses : poses + MOST_JUDGED]] = True
         return fitted, judged
     if table.moving:
-        judged[int(0.8 * count) :] = True
+        fifth = 4 - seed % 5
+        judged[int(0.2 * fifth * count) : int(0.2 * (fifth + 1) * count)] = True
     else:
         order = np.random.default_rng(seed).permutation(count)
         judged[order[: max(count // 5, 1)]] = True

@@ -105,6 +105,7 @@ def test_a_recording_is_judged_on_its_end_and_poses_at_random():
     moving = table(timestamp=np.arange(50) * 0.01, actual_q=q)
     at_rest = table(timestamp=np.arange(50) * 30.0, actual_q=q)
     assert halves(moving)[1].nonzero()[0].tolist() == list(range(40, 50))
+    assert halves(moving, seed=3)[1].nonzero()[0].tolist() == list(range(10, 20))
     fitted, judged = halves(at_rest)
     assert judged.sum() == 10 and not (fitted & judged).any()
     assert np.ptp(judged.nonzero()[0]) > 15
