@@ -26,8 +26,10 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 # how fast examples are drawn says something of the machine, nothing of the code
+settings.register_profile("search", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# the same examples in every run; --hypothesis-profile=search looks for others
 settings.register_profile(
-    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    "any machine", settings.get_profile("search"), derandomize=True, database=None
 )
 settings.load_profile("any machine")
 
