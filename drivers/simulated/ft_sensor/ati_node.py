@@ -19,7 +19,7 @@ FULL = 30000.0  # gauge counts
 
 
 class _CanNode(SimulatedSensor):
-    """A sensor on a CAN bus; it hears ``first`` and identifiers like it in the bits of ``mask``."""
+    """A sensor on a CAN bus; it receives ``first`` and what is like it in the bits of ``mask``."""
 
     def __init__(self, reaction: Reaction, bus: BusSettings, first: int, mask: int) -> None:
         super().__init__(reaction)

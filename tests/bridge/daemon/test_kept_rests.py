@@ -258,7 +258,7 @@ def test_a_disk_that_does_not_answer_keeps_no_daemon_from_its_end(
         for _ in range(3):  # nothing waits behind a write that hangs
             assert kept.step(None, None, at_once=True) == ""  # type: ignore[arg-type]
         assert f"{path}: the file system does not answer" in kept.finish()
-        assert kept.finish() == ""  # told once
+        assert kept.finish() == ""  # reported once
         assert kept._writing is not None
         assert kept._writing.daemon  # the interpreter does not wait for it either
         answers.set()

@@ -58,7 +58,9 @@ def test_a_loop_waits_for_the_one_that_ramps_out_and_says_so_once(other: socket.
 
 
 def test_another_controller_is_not_waited_for(other: socket.socket) -> None:
-    claimed_controller(f"{ADDRESS}2", no_event, ByHand()).close()
+    clock = ByHand()
+    claimed_controller(f"{ADDRESS}2", no_event, clock).close()
+    assert clock.now == ByHand().now
 
 
 def test_a_loop_that_does_not_end_is_a_failure_at_run_time(other: socket.socket) -> None:

@@ -181,7 +181,9 @@ def test_its_server_imports_nothing_from_the_working_folder(
     monkeypatch.chdir(tmp_path)
     settings = SetpointSettings(source="modbus", port=0)
     source = make_source(settings, 3, True, Path(), clock=SYSTEM)
+    assert isinstance(source, ModbusSource)
     source.open()
+    assert source.port  # its server has answered
     source.close()
 
 
