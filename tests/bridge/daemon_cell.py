@@ -135,9 +135,9 @@ class Run:
     """A daemon in a thread of the test; its loop is a process as always."""
 
     def __init__(self, cell: Path, arm: bool = False, observe: bool = False,
-                 duration: float | None = None) -> None:  # fmt: skip
-        self.output: list[str] = []
-        settings = settings_of(load_cell(cell))
+                 duration: float | None = None, hang_timeout: float = 10.0) -> None:  # fmt: skip
+        self.output: list[str] = []  # 1 s would end loops that a busy machine suspends
+        settings = settings_of(load_cell(cell)).model_copy(update={"hang_timeout": hang_timeout})
         self.daemon = Daemon(settings, may_write=not observe, say=self.output.append, clock=SYSTEM)
         self.summary: RunSummary | None = None
         self.error: Exception | None = None

@@ -56,7 +56,7 @@ def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Sign
 @pytest.mark.slow
 @pytest.mark.realtime(limit=0.3)
 def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> None:
-    with Run(robot.cell(), arm=True) as run:
+    with Run(robot.cell(), arm=True, hang_timeout=1.0) as run:
         run.compensate()
         run.write(60)
         pid = run.daemon.loop_pid

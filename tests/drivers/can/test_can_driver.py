@@ -111,6 +111,7 @@ def test_another_commander_on_the_bus_keeps_us_from_arming(served):
         served.driver.arm(state)
     assert not any(served.nodes.enabled)
     task.stop()
+    task.thread.join()  # it may have a frame to send yet
     time.sleep(served.settings.foreign_quiet)
     armed(served)
     bus.shutdown()
