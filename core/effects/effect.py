@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from gapbridge.core.motion import Motion
 
 CHANNELS = {"position": "m", "wrench": "N", "tracking": "rad", "torque": "Nm"}
+WRENCH_AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,7 @@ class Effect(ABC):
     equivalents: ClassVar[Mapping[str, str]] = {}  # effect: on which data it is the same
     simulator_advice: ClassVar[str] = ""  # the advice if a simulator's model cannot include it
     simulated_as: ClassVar[Kind | None] = None  # the kind of its first value in a simulator's model
+    fixed_parameters: ClassVar[tuple[Parameter, ...]]  # of every occurrence, on any arm
     of_the_arm: ClassVar[bool] = True  # False: an effect of the measurement, not of the arm
 
     # texts
@@ -154,8 +156,8 @@ class Effect(ABC):
         return (Site(),)
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the parameters of one occurrence."""
-        raise NotImplementedError
+        """Return the parameters of one occurrence; default: ``fixed_parameters``."""
+        return self.fixed_parameters
 
     def angle_columns(self, site: Site, q: Array) -> Array | None:
         """Return d joint angle / d parameter (N, d) at encoder angles ``q`` (N,) of its joint.

@@ -21,6 +21,7 @@ from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_loads
 from gapbridge.core.dynamics import predict_wrench, with_pieces
 from gapbridge.core.effects import Term
+from gapbridge.core.effects.effect import WRENCH_AXES
 from gapbridge.core.estimation.robust import scale_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
@@ -28,7 +29,6 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, motion_of
 from gapbridge.core.sessions import session_of
 
-AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 USUAL_WEIGHT = 10.0  # N/Nm of torques relative to forces, without a noise to measure it
 WEIGHTS = (1.0, 1000.0)  # N/Nm, plausible range
 
@@ -83,7 +83,7 @@ def _observed(
         quantities=quantities(log, motion) | _readings(expected),
         groups=conditions(motion),
         rows=motion.rows,
-        axes=AXES,
+        axes=WRENCH_AXES,
         payload_mass=motion.loads.payload_mass,
         order_in_time=motion.moving,
         unnamed=lambda: unnamed_loads(model, motion, "wrench"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.effect import Effect, Parameter, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
@@ -36,10 +36,7 @@ class Payload(Effect):
     motion = "poses that change how the load pulls"
     equivalents: ClassVar = {"ft_bias": "a flange that never turns against gravity"}
     simulator_advice = "change the load's mass where it is modelled"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the extra mass."""
-        return (Parameter("", "kg", 1.0),)
+    fixed_parameters = (Parameter("", "kg", 1.0),)  # the extra mass
 
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Add the mass."""

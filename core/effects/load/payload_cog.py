@@ -43,10 +43,7 @@ class PayloadCog(Effect):
         "ft_bias": "one load, and a flange that never turns against gravity",
     }
     simulator_advice = "move the centre of mass of the body that models the load"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the shift in flange axes."""
-        return tuple(Parameter(k, "m", 0.02, -1.0, 1.0) for k in "xyz")
+    fixed_parameters = tuple(Parameter(k, "m", 0.02, -1.0, 1.0) for k in "xyz")  # flange axes
 
     def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
         """Return it in a simulator's terms."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
+from gapbridge.core.effects.effect import JointEffect, Parameter, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
@@ -31,10 +31,7 @@ class Backlash(JointEffect):
     simulated_as = Kind.PLAY
     motion = "poses reached from both sides of the joint"
     simulator_advice = "add a joint about the same axis, limited to half the clearance on each side"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the whole clearance."""
-        return (Parameter("", "rad", 3e-4, 0.0, 0.1),)
+    fixed_parameters = (Parameter("", "rad", 3e-4, 0.0, 0.1),)  # the whole clearance
 
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Turn the joint back by half the clearance."""

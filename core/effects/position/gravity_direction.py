@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.effect import Effect, Parameter, Term
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
@@ -26,10 +26,10 @@ class GravityDirection(Effect):
     channels = ("position",)
     motion = "a compliant model and poses all around the base"
     simulator_advice = "turn the base, or gravity in the world"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the rotation vector's x and y, base axes."""
-        return (Parameter("x", "rad", 0.02, -0.5, 0.5), Parameter("y", "rad", 0.02, -0.5, 0.5))
+    fixed_parameters = (  # the rotation vector's x and y, base axes
+        Parameter("x", "rad", 0.02, -0.5, 0.5),
+        Parameter("y", "rad", 0.02, -0.5, 0.5),
+    )
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Turn gravity."""

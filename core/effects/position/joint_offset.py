@@ -33,10 +33,7 @@ class JointOffset(JointEffect):
     channels = ("position",)
     simulated_as = Kind.JOINT_ZERO
     motion = "poses that differ in the other joints"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the offset."""
-        return (Parameter("", "rad", 1e-3, -0.5, 0.5),)
+    fixed_parameters = (Parameter("", "rad", 1e-3, -0.5, 0.5),)
 
     def angle_columns(self, site: Site, q: Array) -> Array:
         """Return ones: the same turn at every angle."""

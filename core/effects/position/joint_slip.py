@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, rows_after
+from gapbridge.core.effects.effect import JointEffect, Parameter, Term, rows_after
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
@@ -33,10 +33,7 @@ class JointSlip(JointEffect):
     simulated_as = Kind.JOINT_ZERO  # the arm as it is since
     motion = "poses before and after the moment, that differ in the other joints"
     equivalents: ClassVar = {"joint_offset": "no pose before the moment"}
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the step, and when it happened."""
-        return (Parameter("", "rad", 1e-3, -1.0, 1.0), Parameter("time", "s", 1.0))
+    fixed_parameters = (Parameter("", "rad", 1e-3, -1.0, 1.0), Parameter("time", "s", 1.0))
 
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Turn the joint further in the rows after the slip."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from gapbridge.core.effects.effect import Effect, Parameter, Site, Term, rows_after
+from gapbridge.core.effects.effect import Effect, Parameter, Term, rows_after
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
@@ -37,11 +37,10 @@ class TargetSlip(Effect):
     }
     of_the_arm = False
     simulator_advice = "none needed: a simulated target does not move"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the shift in flange axes, and when it happened."""
-        shift = tuple(Parameter(k, "m", 1e-3, -0.5, 0.5) for k in "xyz")
-        return (*shift, Parameter("time", "s", 1.0))
+    fixed_parameters = (  # flange axes
+        *(Parameter(k, "m", 1e-3, -0.5, 0.5) for k in "xyz"),
+        Parameter("time", "s", 1.0),
+    )
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Move the TCP."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.effect import Effect, Parameter, Term
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
@@ -29,10 +29,7 @@ class ThermalDrift(Effect):
     needs = ("joint_temperatures",)
     motion = "joint temperatures that change by several degrees"
     simulator_advice = "scale the links' lengths for one temperature"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the coefficient of expansion."""
-        return (Parameter("", "1/K", 1e-5, 0.0, 1e-3),)
+    fixed_parameters = (Parameter("", "1/K", 1e-5, 0.0, 1e-3),)  # coefficient of expansion
 
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Lengthen the links."""

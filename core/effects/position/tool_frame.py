@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.effect import Effect, Parameter, Term
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
@@ -28,13 +28,10 @@ class ToolFrame(Effect):
     estimated_with_links = True
     channels = ("position",)
     motion = "poses that differ in the orientation of the flange"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the shift (m) and the rotation vector (rad), flange axes."""
-        shift = tuple(Parameter(k, "m", 1e-3, -0.5, 0.5) for k in "xyz")
-        return shift + tuple(
-            Parameter(k, "rad", 3e-3, -0.5, 0.5, of_rotation=True) for k in ("rx", "ry", "rz")
-        )
+    fixed_parameters = (  # shift and rotation vector, flange axes
+        *(Parameter(k, "m", 1e-3, -0.5, 0.5) for k in "xyz"),
+        *(Parameter(k, "rad", 3e-3, -0.5, 0.5, of_rotation=True) for k in ("rx", "ry", "rz")),
+    )
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Move the TCP."""

@@ -33,13 +33,10 @@ class TransmissionError(JointEffect):
     simulator_advice = (
         "add amplitude sin(order q + phase) to the commanded angle in the control loop"
     )
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the coefficients of sine and cosine, in which the effect is linear."""
-        return (
-            Parameter("sine", "rad", 3e-4, -0.1, 0.1),
-            Parameter("cosine", "rad", 3e-4, -0.1, 0.1),
-        )
+    fixed_parameters = (  # coefficients of sine and cosine, in which the effect is linear
+        Parameter("sine", "rad", 3e-4, -0.1, 0.1),
+        Parameter("cosine", "rad", 3e-4, -0.1, 0.1),
+    )
 
     def angle_columns(self, site: Site, q: Array) -> Array:
         """Return sine and cosine of the angle times the order."""

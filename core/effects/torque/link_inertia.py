@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
+from gapbridge.core.effects.effect import JointEffect, Parameter, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
@@ -31,10 +31,8 @@ class LinkInertia(JointEffect):
     channels = ("torque",)
     simulated_as = Kind.LINK_SCALE
     motion = "many poses, and accelerations of all joints up to the link"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the relative increase; joint i stands for link i, which it turns."""
-        return (Parameter("", "", 0.05, -1.0, 20.0),)
+    # joint i stands for link i, which it turns
+    fixed_parameters = (Parameter("", "", 0.05, -1.0, 20.0),)
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add the link's torques once more, scaled."""

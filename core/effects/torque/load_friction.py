@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect
+from gapbridge.core.effects.effect import Parameter, Term, TorqueEffect
 
 if TYPE_CHECKING:
-    from gapbridge.core.arm import Arm
     from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
 
@@ -32,10 +31,7 @@ class LoadFriction(TorqueEffect):
     motion = "the joint moved both ways under loads that change"
     equivalents: ClassVar = {"coulomb_friction": "motion under one load"}
     simulator_advice = "friction by load in the control loop, or the simulator's actuator"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the share of the load."""
-        return (Parameter("", "", 0.05, 0.0, 5.0),)
+    fixed_parameters = (Parameter("", "", 0.05, 0.0, 5.0),)  # share of the load
 
     def added(self, term: Term, i: int, motion: Motion) -> Array:
         """Return the friction that the motor overcomes."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
+from gapbridge.core.effects.effect import JointEffect, Parameter, Term
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
@@ -28,13 +28,8 @@ class TorqueConstant(JointEffect):
     motion = "a joint that carries torque, the more changing the better"
     equivalents: ClassVar = {"torque_offset": "motion in which the joint's torque never changes"}
     simulator_advice = "scale the measured torque by 1 / (1 + value) before it is compared"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the relative increase.
-
-        Limited to half: a larger one replaces friction and first moments (KUKA KR 300, UR10e).
-        """
-        return (Parameter("", "", 0.05, -0.5, 0.5),)
+    # limited to half: a larger one replaces friction and first moments (KUKA KR 300, UR10e)
+    fixed_parameters = (Parameter("", "", 0.05, -0.5, 0.5),)
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Scale the joint's torque."""

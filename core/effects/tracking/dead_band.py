@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from gapbridge.core.effects.effect import Parameter, ServoEffect, Site, Term
+from gapbridge.core.effects.effect import Parameter, ServoEffect, Term
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
@@ -35,10 +35,7 @@ class DeadBand(ServoEffect):
         "tracking_lag": "motion one way at one speed",
     }
     simulator_advice = "in the controller's settings, or a second, limited joint behind each servo"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the half width w."""
-        return (Parameter("", "rad", 1e-3, 0.0, 0.2),)
+    fixed_parameters = (Parameter("", "rad", 1e-3, 0.0, 0.2),)  # the half width w
 
     def follow(self, term: Term, time: Array, command: Array, first: float) -> Array:
         """Move the joint only where its target has left the band."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import Parameter, ServoEffect, Site, Term
+from gapbridge.core.effects.effect import Parameter, ServoEffect, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    from gapbridge.core.arm import Arm
     from gapbridge.core.arrays import Array
 
 
@@ -33,10 +32,7 @@ class Latency(ServoEffect):
     needs = ("timestamp",)
     motion = "a recording of changing speeds of the joint"
     simulator_advice = "delay the command in the control loop"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the delay."""
-        return (Parameter("", "s", 5e-3, 0.0, 2.0),)
+    fixed_parameters = (Parameter("", "s", 5e-3, 0.0, 2.0),)
 
     def follow(self, term: Term, time: Array, command: Array, first: float) -> Array:
         """Look the command up in the past."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import Parameter, ServoEffect, Site, Term
+from gapbridge.core.effects.effect import Parameter, ServoEffect, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    from gapbridge.core.arm import Arm
     from gapbridge.core.arrays import Array
 
 
@@ -31,10 +30,7 @@ class TrackingLag(ServoEffect):
     needs = ("timestamp",)
     motion = "a recording of the joint with accelerations, the sharper the better"
     simulator_advice = "filter the command in the control loop"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the time constant."""
-        return (Parameter("", "s", 5e-3, 0.0, 2.0),)
+    fixed_parameters = (Parameter("", "s", 5e-3, 0.0, 2.0),)  # time constant
 
     def follow(self, term: Term, time: Array, command: Array, first: float) -> Array:
         """Let the joint follow."""

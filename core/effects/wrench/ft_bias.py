@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.effect import WRENCH_AXES, Effect, Parameter, Term
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
     from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
-
-
-AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
 class FtBias(Effect):
@@ -34,12 +31,10 @@ class FtBias(Effect):
     channels = ("wrench",)
     motion = "poses that turn the flange by tens of degrees against gravity"
     simulator_advice = "subtract the bias from the sensor's readings"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return force (N) and torque (Nm) along the flange axes."""
-        units = ("N",) * 3 + ("Nm",) * 3
-        scales = (1.0,) * 3 + (0.1,) * 3
-        return tuple(Parameter(*p) for p in zip(AXES, units, scales, strict=True))
+    fixed_parameters = (
+        *(Parameter(axis, "N", 1.0) for axis in WRENCH_AXES[:3]),
+        *(Parameter(axis, "Nm", 0.1) for axis in WRENCH_AXES[3:]),
+    )
 
     def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Add the constant."""

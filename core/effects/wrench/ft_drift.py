@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.effect import WRENCH_AXES, Effect, Parameter, Term
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
     from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
-
-
-AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
 class FtDrift(Effect):
@@ -31,12 +28,10 @@ class FtDrift(Effect):
     needs = ("timestamp",)
     motion = "a session long enough for the zero to move, with poses that come back"
     simulator_advice = "subtract the drift from the sensor's readings"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the rates along the flange axes."""
-        units = ("N/s",) * 3 + ("Nm/s",) * 3
-        scales = (1e-3,) * 3 + (1e-4,) * 3
-        return tuple(Parameter(*p) for p in zip(AXES, units, scales, strict=True))
+    fixed_parameters = (
+        *(Parameter(axis, "N/s", 1e-3) for axis in WRENCH_AXES[:3]),
+        *(Parameter(axis, "Nm/s", 1e-4) for axis in WRENCH_AXES[3:]),
+    )
 
     def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Add what has run up since the log's first row."""

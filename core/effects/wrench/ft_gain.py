@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.effect import WRENCH_AXES, Effect, Parameter, Site, Term
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
     from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
-
-
-AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
 class FtGain(Effect):
@@ -33,10 +30,7 @@ class FtGain(Effect):
     channels = ("wrench",)
     motion = "a load on every axis: the flange turned every way, with pulls or several payloads"
     simulator_advice = "divide the sensor's readings by 1 + gain"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the relative errors along the flange axes."""
-        return tuple(Parameter(axis, "", 0.02, -0.95, 10.0) for axis in AXES)
+    fixed_parameters = tuple(Parameter(axis, "", 0.02, -0.95, 10.0) for axis in WRENCH_AXES)
 
     def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Scale the axes."""

@@ -32,10 +32,9 @@ class FtMisalignment(Effect):
     channels = ("wrench",)
     motion = "loads along at least two directions of the flange"
     simulator_advice = "turn the sensor's frame, or its readings"
-
-    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the rotation vector of the sensor in the flange."""
-        return tuple(Parameter(axis, "rad", 0.01, -math.pi, math.pi) for axis in ("rx", "ry", "rz"))
+    fixed_parameters = tuple(  # the rotation vector of the sensor in the flange
+        Parameter(axis, "rad", 0.01, -math.pi, math.pi) for axis in ("rx", "ry", "rz")
+    )
 
     def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
         """Return it in a simulator's terms."""
