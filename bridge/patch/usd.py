@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,9 +25,6 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import transform
-
-if TYPE_CHECKING:
-    pass
 
 PER_DEGREE = np.pi / 180  # rad: factor from a drive's gain per rad to one per degree
 SMALL = 1e-4  # kg, kg m2 of a body between two joints

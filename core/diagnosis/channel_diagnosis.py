@@ -1,9 +1,9 @@
-"""The diagnosis of one channel of a log."""
+"""The diagnosis of one channel of a log, and the terms that diagnoses add to a model."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -17,8 +17,11 @@ from gapbridge.core.diagnosis.judgement import Judgement
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.selection.candidate import joint_target
 from gapbridge.core.diagnosis.selection.selection import Selection
-from gapbridge.core.effects import Term
+from gapbridge.core.effects import CATALOGUE, Reported, Term, totals
 from gapbridge.core.estimation.least_squares import basis_of
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.sessions import session_of
 
 
 class Verdict(StrEnum):
@@ -107,3 +110,84 @@ def locate(selection: Selection, gap: Array, accused: Sequence[int]) -> Where:
     ranked = sorted(((j, min(max(s, 0.0), 1.0)) for j, s in shares.items()), key=lambda i: -i[1])
     depends = dependence(space, selection.nuisance_basis, (), selection.groups)
     return Where(tuple(ranked), axes, tuple(depends[:6]))
+
+
+def first_session(moment: float, log: Log) -> str:
+    """Return the name of the first session with rows after ``moment``, s of the joined clock."""
+    session, after = session_of(log), log.times() > moment
+    return log.session_names[int(session[after].min() if after.any() else session.max())]
+
+
+def on_own_clocks(channel: ChannelDiagnosis, log: Log) -> ChannelDiagnosis:
+    """Return a channel's diagnosis whose moments are of the sessions' own clocks.
+
+    Where these overlap, a moment has no value (nan), but the first session after it.
+    """
+    if log.one_clock:
+        return channel
+
+    def with_session(parameters: Iterable[Reported]) -> tuple[Reported, ...]:
+        return tuple(
+            replace(p, value=float("nan"), std=None, session=first_session(p.value, log))
+            if p.is_time else p
+            for p in parameters
+        )  # fmt: skip
+
+    def causes(some: Iterable[Cause]) -> tuple[Cause, ...]:
+        return tuple(replace(cause, parameters=with_session(cause.parameters)) for cause in some)
+
+    def transfer(one: SessionTransfer) -> SessionTransfer:
+        return replace(one, values=tuple((s, with_session(p)) for s, p in one.values))
+
+    return replace(
+        channel, causes=causes(channel.causes), stand_ins=causes(channel.stand_ins),
+        session_transfer=tuple(transfer(one) for one in channel.session_transfer),
+    )  # fmt: skip
+
+
+def model_terms(channels: Sequence[ChannelDiagnosis], log: Log) -> list[Term]:
+    """Return the causes' terms; of several channels (a payload) the most certain value."""
+    best: dict[tuple[str, object], tuple[float, Term]] = {}
+    for channel in channels:
+        for cause in channel.causes:
+            for term, deviation in zip(cause.terms, cause.relative_deviation, strict=True):
+                key = (term.effect, term.site)
+                if key not in best or deviation < best[key][0]:
+                    best[key] = (deviation, term)
+    return _applied([term for _, term in best.values()], log)
+
+
+def terms_with_stand_ins(channels: Sequence[ChannelDiagnosis], log: Log) -> list[Term]:
+    """Return the causes' terms and the stand-ins, with the values of their common fit.
+
+    Terms of that fit that have been withdrawn since are left out.
+    """
+    terms = {(t.effect, t.site): t for t in model_terms(channels, log)}
+    for channel in channels:
+        named = {
+            (t.effect, t.site)
+            for cause in (*channel.causes, *channel.stand_ins)
+            for t in cause.terms
+        }
+        together = {(t.effect, t.site): t for t in channel.fitted_together}
+        terms |= {key: term for key, term in together.items() if key in named}
+    return _applied(list(terms.values()), log)
+
+
+def with_causes(model: Model, terms: Sequence[Term]) -> Model:
+    """Return the model with the terms added to its own: what is gone is in it no more."""
+    return replace(model, terms=totals((*model.terms, *terms)))
+
+
+def _applied(terms: list[Term], log: Log) -> list[Term]:
+    """Return the terms; steps as applied to all rows where overlapping clocks have no time of them.
+
+    Their time is then one second before the log's.
+    """
+    if log.one_clock:
+        return terms
+    before = float(log.times()[0]) - 1.0
+    return [
+        replace(t, values=(*t.values[:-1], before)) if CATALOGUE[t.effect].at_moment else t
+        for t in terms
+    ]

@@ -26,7 +26,17 @@ from gapbridge.core.diagnosis.all_rows.remaining_structure import (
 )
 from gapbridge.core.diagnosis.all_rows.row_sums import RowSums, Streamed
 from gapbridge.core.diagnosis.causes import Cause, Considered, causes_of, considered_of
-from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict, Where, locate
+from gapbridge.core.diagnosis.channel_diagnosis import (
+    ChannelDiagnosis,
+    Verdict,
+    Where,
+    first_session,
+    locate,
+    model_terms,
+    on_own_clocks,
+    terms_with_stand_ins,
+    with_causes,
+)
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
 from gapbridge.core.diagnosis.criteria import (
@@ -57,14 +67,12 @@ from gapbridge.core.diagnosis.judgement import (
 )
 from gapbridge.core.diagnosis.log_checks.missing_flexibility import flexibility_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
-from gapbridge.core.diagnosis.model_terms import model_terms, terms_with_stand_ins, with_causes
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.selection.rounds import select
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.step_times import slips
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
-from gapbridge.core.diagnosis.session_clocks import first_session, on_own_clocks
 from gapbridge.core.diagnosis.thinning import thinned, thinned_poses
 from gapbridge.core.diagnosis.value_stability import closes_gap
 from gapbridge.core.effects import Term, correcting, flexibility_effects

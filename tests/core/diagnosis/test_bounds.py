@@ -10,9 +10,9 @@ import small_arm as small
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.diagnosis.channels import position, torque, wrench
-from gapbridge.core.diagnosis.selection.bounds import payload_bounds
 from gapbridge.core.diagnosis.selection.candidate import named_candidates
 from gapbridge.core.diagnosis.selection.refit import _step
+from gapbridge.core.diagnosis.selection.rounds import payload_bounds
 from gapbridge.core.metrology import Metrology
 
 ARM = builtin_arm("ur5")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.channel_diagnosis import with_causes
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.model_terms import with_causes
-from gapbridge.core.diagnosis.selection.bounds import bounded, payload_bounds
 from gapbridge.core.diagnosis.selection.candidate import named_candidates
 from gapbridge.core.diagnosis.selection.refit import with_free_shape
+from gapbridge.core.diagnosis.selection.rounds import bounded, payload_bounds
 from gapbridge.core.effects import CATALOGUE, Site, Term, totals
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log

@@ -17,9 +17,9 @@ from gapbridge.bridge.api.uncertainty import cause_entries
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text
 from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.across_sessions import SessionTransfer, session_transfer
+from gapbridge.core.diagnosis.channel_diagnosis import terms_with_stand_ins
 from gapbridge.core.diagnosis.channels.position import observe
 from gapbridge.core.diagnosis.diagnosis import _log_findings, _slips, diagnose
-from gapbridge.core.diagnosis.model_terms import terms_with_stand_ins
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError

@@ -25,7 +25,7 @@ from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning import design
 from gapbridge.core.planning.candidates import sample_candidates
-from gapbridge.core.planning.design import draw_reference
+from gapbridge.core.planning.design import Visit, draw_reference, plan_route
 from gapbridge.core.planning.exchange import (
     Choice,
     backward_eliminated,
@@ -33,7 +33,6 @@ from gapbridge.core.planning.exchange import (
     forward_selected,
 )
 from gapbridge.core.planning.information import information_of, inverse, whitened_rows
-from gapbridge.core.planning.route import Visit, plan_route
 from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 
