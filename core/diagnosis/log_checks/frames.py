@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gapbridge.core.arrays import Array
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.criteria import (
     MAX_ARM_ERROR,
     MAX_RATIO_TO_BEST,
@@ -23,7 +23,7 @@ from gapbridge.core.diagnosis.log_checks.kinematics import (
     other_arms,
     other_models,
 )
-from gapbridge.core.diagnosis.log_checks.signs import spread_of
+from gapbridge.core.diagnosis.log_checks.signs import checked_rows, spread_of
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.registration import register_robustly
 from gapbridge.core.log.log import Log
@@ -32,7 +32,6 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
-MAX_ROWS = 200  # that are checked, evenly spaced
 MIN_ROWS = 6
 
 
@@ -42,10 +41,9 @@ def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFind
     q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
     if measured is None or q is None:
         return []
-    good = np.flatnonzero(np.isfinite(measured).all(axis=1) & np.isfinite(q).all(axis=1))
-    if len(good) < MIN_ROWS:
+    rows = checked_rows(q, measured)
+    if len(rows) < MIN_ROWS:
         return []
-    rows = good[np.unique(np.linspace(0, len(good) - 1, MAX_ROWS).astype(int))]
     try:
         predicted = model.rigid_pose(q[rows]).position
     except InputError:
@@ -74,7 +72,7 @@ def _median_distance(measured: Array, predicted: Array) -> float:
 
 
 def _position_finding(
-    model: Model, q: Array, measured: Array, rows: Array, distance: float, rotations: Array | None
+    model: Model, q: Array, measured: Array, rows: Index, distance: float, rotations: Array | None
 ) -> LogFinding:
     """Return the finding on positions that do not agree with the arm."""
     others = ((mistake, arm, q[rows], measured[rows]) for mistake, arm in other_arms(model))
@@ -93,7 +91,7 @@ def _position_finding(
 
 
 def _mistakes(
-    model: Model, q: Array, measured: Array, rows: Array, rotations: Array | None
+    model: Model, q: Array, measured: Array, rows: Index, rotations: Array | None
 ) -> Iterator[tuple[LogFinding, Model, Array, Array]]:
     """Yield each mistake with the model, joint angles and positions that correct it."""
     positions = measured[rows]

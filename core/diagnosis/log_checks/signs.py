@@ -56,17 +56,20 @@ def sign_findings(model: Model, log: Log) -> list[LogFinding]:
     return []
 
 
-def _rows(q: Array, *columns: Array | None) -> Index:
+def checked_rows(q: Array, *columns: Array | None) -> Index:
+    """Return at most MAX_ROWS rows, evenly spaced, in which all columns (N, k) are finite."""
     good = np.isfinite(q).all(axis=1)
     for column in columns:
         if column is not None:
-            good &= np.isfinite(column.reshape(len(q), -1)).all(axis=1)
+            good &= np.isfinite(column).all(axis=1)
     rows = np.flatnonzero(good)
     take = np.linspace(0, max(len(rows) - 1, 0), MAX_ROWS).astype(int)
     return rows[np.unique(take)] if len(rows) else rows
 
 
-def _loads(log: Log, rows: Index, pull: Array | None) -> Loads:
+def loads_with(log: Log, rows: Index, pull: Array | None) -> Loads:
+    """Return the loads in some rows, with a pull (k, 6) on the tool; the cell's where not known."""
+
     def some(name: str) -> Array | None:
         column = log.get(name)
         return None if column is None or not np.isfinite(column).all() else column[rows]
@@ -99,14 +102,16 @@ def _by_deflection(model: Model, log: Log, q: Array, pull: Array) -> LogCheck | 
     measured = log.get("measured_position")
     if measured is None:
         return None
-    rows = _rows(q, measured, pull)
+    rows = checked_rows(q, measured, pull)
     pulled = np.abs(pull[rows]).max(axis=1, initial=0.0) > MIN_FORCE
     if pulled.sum() < MIN_ROWS or 3 * len(rows) < 2 * (3 * model.arm.n + 6):
         return None
     residual = {}
     try:
         for check, variant in _variants(model, q[rows], pull[rows]).items():
-            off = _compliance_residual(model, q[rows], measured[rows], _loads(log, rows, variant))
+            off = _compliance_residual(
+                model, q[rows], measured[rows], loads_with(log, rows, variant)
+            )
             residual[check] = float(np.median(np.linalg.norm(off[pulled], axis=1)))
     except InputError:
         return None
@@ -136,7 +141,7 @@ def _predicted(
 ) -> Array:
     """Return the prediction of a channel at rest; accelerations matter little to a sign."""
     predictor = predict_wrench if name == "ft_raw_wrench" else predict_torque
-    motion = Motion.at_rest(q[rows], _loads(log, rows, pull))
+    motion = Motion.at_rest(q[rows], loads_with(log, rows, pull))
     return predictor(replace(model, terms=()), motion)
 
 
@@ -152,7 +157,7 @@ def _by_sensor(name: str) -> Callable[[Model, Log, Array, Array], LogCheck | Non
         column = log.get(name)
         if column is None or (name != "ft_raw_wrench" and not model.arm.mass.any()):
             return None
-        rows = _rows(q, column, pull)
+        rows = checked_rows(q, column, pull)
         pulled = rows[np.abs(pull[rows]).max(axis=1, initial=0.0) > MIN_FORCE]
         if len(pulled) < MIN_ROWS:
             return None
@@ -182,7 +187,7 @@ def _is_reversed(model: Model, log: Log, q: Array, name: str) -> bool:
     pull = log.get("actual_TCP_force")
     if column is None:
         return False
-    rows = _rows(q, column, pull)
+    rows = checked_rows(q, column, pull)
     if len(rows) < MIN_ROWS:
         return False
     expected = _predicted(model, log, q, name, None if pull is None else pull[rows], rows)

@@ -14,15 +14,14 @@ import numpy as np
 
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.criteria import MAX_SHARE_WITH_OTHER_SIGN
+from gapbridge.core.diagnosis.log_checks.signs import checked_rows, loads_with
 from gapbridge.core.dynamics import predict_torque
 from gapbridge.core.estimation.least_squares import solve
-from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 
-MAX_ROWS = 200  # that are checked, evenly spaced
 MIN_ROWS = 30
 MIN_ANGLE = 0.35  # rad from the cell's gravity: no base is levelled worse
 STRENGTH = 0.7, 1.4  # times the cell's gravity: the links' masses are not exact
@@ -41,7 +40,7 @@ def weight_findings(model: Model, log: Log) -> list[LogFinding]:
         return []
     speed = log.get("actual_qd")
     speed = np.gradient(q, axis=0) if speed is None and len(q) > 1 else speed
-    rows = _rows(q, torque, speed)
+    rows = checked_rows(q, torque, speed)
     if speed is None or len(rows) < MIN_ROWS:
         return []
     if (torque[rows] == torque[rows[0]]).all():  # the controller gives none
@@ -67,25 +66,9 @@ def weight_findings(model: Model, log: Log) -> list[LogFinding]:
     ]
 
 
-def _rows(*columns: Array | None) -> Index:
-    good = np.ones(len(columns[0]) if columns[0] is not None else 0, dtype=bool)
-    for column in columns:
-        if column is not None:
-            good &= np.isfinite(column).all(axis=1)
-    rows = np.flatnonzero(good)
-    take = np.linspace(0, max(len(rows) - 1, 0), MAX_ROWS).astype(int)
-    return rows[np.unique(take)] if len(rows) else rows
-
-
 def _weights(model: Model, log: Log, q: Array, rows: Index) -> Array:
     """Return the static torques (N, n, 3) Nm per m/s² of gravity along each axis of the base."""
-
-    def some(name: str) -> Array | None:
-        column = log.get(name)
-        return None if column is None or not np.isfinite(column).all() else column[rows]
-
-    loads = Loads(payload_mass=some("payload"), payload_cog=some("payload_cog"), wrench=None)
-    at_rest = Motion.at_rest(q[rows], loads)
+    at_rest = Motion.at_rest(q[rows], loads_with(log, rows, None))
     along = [predict_torque(replace(model, terms=(), gravity=axis), at_rest) for axis in np.eye(3)]
     return np.stack(along, axis=2)
 
