@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -94,11 +94,15 @@ def export(recording: Path, out: Path, span: Span | None = None) -> Exported:
     first, last = _bounds(recording, span or Span())
     columns = _columns_of(recording, first, last)
     exported, every = Exported(), _every(recording)
-    writer = _Parquet if out.suffix.lower() in PARQUET else _Csv
-    with replacing_bytes(out) as file, writer(file) as log:
+
+    def tables() -> Iterator[pyarrow.Table]:
         for batch in _within(recording, first, last):
             exported.take(batch, every)
-            log.write(_table(batch, columns))
+            yield _table(batch, columns)
+
+    write = _write_parquet if out.suffix.lower() in PARQUET else _write_csv
+    with replacing_bytes(out) as file:
+        write(file, tables())
     return exported
 
 
@@ -171,58 +175,27 @@ def _state(batch: Batch, value: float) -> str:
     return known.get(int(value), str(int(value))).lower()
 
 
-class _Csv:
-    """Writes rows of CSV; numbers read back exactly."""
+def _write_csv(file: IO[bytes], tables: Iterator[pyarrow.Table]) -> None:
+    """Write tables as rows of CSV; numbers read back exactly."""
+    from pyarrow import csv
 
-    def __init__(self, file: Any) -> None:
-        self._file = file
-        self._begun = False
-
-    def write(self, table: pyarrow.Table) -> None:
-        from pyarrow import csv
-
-        if not self._begun:
-            self._file.write((",".join(table.column_names) + "\n").encode())
-        self._begun = True
-        options = csv.WriteOptions(include_header=False, quoting_style="none")
-        csv.write_csv(table, self._file, options)
-
-    def __enter__(self) -> _Csv:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
+    options = csv.WriteOptions(include_header=False, quoting_style="none")
+    for number, table in enumerate(tables):
+        if number == 0:
+            file.write((",".join(table.column_names) + "\n").encode())
+        csv.write_csv(table, file, options)
 
 
-class _Parquet:
-    """Writes row groups of a Parquet file."""
+def _write_parquet(file: IO[bytes], tables: Iterator[pyarrow.Table]) -> None:
+    """Write tables, at least one, as row groups of a Parquet file."""
+    import pyarrow
+    from pyarrow import parquet
 
-    def __init__(self, file: Any) -> None:
-        self._file = file
-        self._writer: Any = None
-        self._waiting: list[pyarrow.Table] = []
-
-    def write(self, table: pyarrow.Table) -> None:
-        self._waiting.append(table)
-        if sum(len(one) for one in self._waiting) >= GROUP:
-            self._flush()
-
-    def _flush(self) -> None:
-        import pyarrow
-        from pyarrow import parquet
-
-        if not self._waiting:
-            return
-        table = pyarrow.concat_tables(self._waiting)
-        self._waiting = []
-        if self._writer is None:
-            self._writer = parquet.ParquetWriter(self._file, table.schema, compression="zstd")
-        self._writer.write_table(table)
-
-    def __enter__(self) -> _Parquet:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._flush()
-        if self._writer is not None:
-            self._writer.close()
+    waiting = [next(tables)]
+    with parquet.ParquetWriter(file, waiting[0].schema, compression="zstd") as writer:
+        for table in tables:
+            if sum(map(len, waiting)) >= GROUP:
+                writer.write_table(pyarrow.concat_tables(waiting))
+                waiting.clear()
+            waiting.append(table)
+        writer.write_table(pyarrow.concat_tables(waiting))
