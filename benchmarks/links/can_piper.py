@@ -16,8 +16,7 @@ from typing import Any
 import can
 from can.interfaces.socketcand.socketcand import SocketCanDaemonBus
 
-from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
-from benchmarks.links.serving import served_cell, thread_served_cell
+from benchmarks.links.case import Cycles, OurCycle, Pause
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
@@ -30,32 +29,9 @@ HUB = f"link: {{driver: can, {COMMON}, interface: socketcand, host: {HOST}, port
 VIRTUAL = f"link: {{driver: can, {COMMON}, interface: virtual, channel: link-costs}}\n"
 
 
-class PiperHubCase(LinkCase):
-    """Between processes, over the socketcand protocol."""
-
-    name, library = "can piper (socketcand)", "python-can + cantools"
-
-    @contextmanager
-    def served(self, pause: Pause) -> Iterator[Cycles]:
-        """Yield the two sides."""
-        with served_cell(HUB) as cell, _armed(cell, pause) as cycles:
-            yield cycles
-
-
-class PiperVirtualCase(LinkCase):
-    """In one process, over python-can's virtual bus; the simulated arm is a thread beside."""
-
-    name, library = "can piper (virtual)", "python-can + cantools"
-
-    @contextmanager
-    def served(self, pause: Pause) -> Iterator[Cycles]:
-        """Yield the two sides, which sleep in between: spinning starves a thread beside."""
-        with thread_served_cell(VIRTUAL) as cell, _armed(cell, time.sleep) as cycles:
-            yield cycles
-
-
 @contextmanager
-def _armed(cell: Cell, pause: Pause) -> Iterator[Cycles]:
+def armed(cell: Cell, pause: Pause) -> Iterator[Cycles]:
+    """Yield the two sides of a served cell."""
     assert isinstance(cell.link, CanSettings)
     with CanDriver(cell.link, cell.model, SYSTEM) as driver:
         ours = OurCycle(driver, cell.model)

@@ -15,8 +15,7 @@ from typing import Any
 
 from canopen.network import MessageListener
 
-from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
-from benchmarks.links.serving import served_cell, thread_served_cell
+from benchmarks.links.case import Cycles, OurCycle, Pause
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
@@ -32,32 +31,9 @@ HUB = f"link: {{driver: canopen, {COMMON}, interface: socketcand, host: {HOST}, 
 VIRTUAL = f"link: {{driver: canopen, {COMMON}, interface: virtual, channel: drive-costs}}\n"
 
 
-class DrivesHubCase(LinkCase):
-    """Between processes, over the socketcand protocol."""
-
-    name, library = "canopen lwa4p (socketcand)", "canopen"
-
-    @contextmanager
-    def served(self, pause: Pause) -> Iterator[Cycles]:
-        """Yield the two sides."""
-        with served_cell(HUB) as cell, _armed(cell, pause) as cycles:
-            yield cycles
-
-
-class DrivesVirtualCase(LinkCase):
-    """In one process, over python-can's virtual bus; the simulated drives are a thread beside."""
-
-    name, library = "canopen lwa4p (virtual)", "canopen"
-
-    @contextmanager
-    def served(self, pause: Pause) -> Iterator[Cycles]:
-        """Yield the two sides, which sleep in between: spinning starves a thread beside."""
-        with thread_served_cell(VIRTUAL) as cell, _armed(cell, time.sleep) as cycles:
-            yield cycles
-
-
 @contextmanager
-def _armed(cell: Cell, pause: Pause) -> Iterator[Cycles]:
+def armed(cell: Cell, pause: Pause) -> Iterator[Cycles]:
+    """Yield the two sides of a served cell."""
     assert isinstance(cell.link, CanopenSettings)
     with CanopenDriver(cell.link, cell.model, SYSTEM) as driver:
         ours = OurCycle(driver, cell.model)

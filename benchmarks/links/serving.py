@@ -5,10 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.links.case import Cycles, LinkCase, Pause
 from benchmarks.server_thread import ServerThread
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.cell import Cell
@@ -59,3 +62,32 @@ def thread_served_cell(link: str) -> Iterator[Cell]:
         found = served_controller(cell, cell.link)
         with ServerThread(found.controller, found.servers, found.host):
             yield cell
+
+
+Armed = Callable[[Cell, Pause], AbstractContextManager[Cycles]]
+
+
+@dataclass(frozen=True)
+class HubCase(LinkCase):
+    """A CAN bus between processes, over the socketcand protocol."""
+
+    name: str
+    library: str
+    link: str  # section of the cell
+    armed: Armed
+
+    @contextmanager
+    def served(self, pause: Pause) -> Iterator[Cycles]:
+        """Yield the two sides."""
+        with served_cell(self.link) as cell, self.armed(cell, pause) as cycles:
+            yield cycles
+
+
+class VirtualCase(HubCase):
+    """In one process, over python-can's virtual bus; what is simulated is a thread beside."""
+
+    @contextmanager
+    def served(self, pause: Pause) -> Iterator[Cycles]:
+        """Yield the two sides, which sleep in between: spinning starves a thread beside."""
+        with thread_served_cell(self.link) as cell, self.armed(cell, time.sleep) as cycles:
+            yield cycles

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.links.can_piper import PiperHubCase, PiperVirtualCase
-from benchmarks.links.canopen_drives import DrivesHubCase, DrivesVirtualCase
+from benchmarks.links import can_piper, canopen_drives
 from benchmarks.links.case import LinkCase
 from benchmarks.links.modbus_tcp import ModbusTcpCase
+from benchmarks.links.serving import HubCase, VirtualCase
 from benchmarks.links.ur_rtde import UrOffsetCase, UrServoCase
 
+PIPER_LIBRARY = "python-can + cantools"
 CASES: tuple[LinkCase, ...] = (
     UrOffsetCase(),
     UrServoCase(),
     ModbusTcpCase(),
-    PiperHubCase(),
-    PiperVirtualCase(),
-    DrivesHubCase(),
-    DrivesVirtualCase(),
+    HubCase("can piper (socketcand)", PIPER_LIBRARY, can_piper.HUB, can_piper.armed),
+    VirtualCase("can piper (virtual)", PIPER_LIBRARY, can_piper.VIRTUAL, can_piper.armed),
+    HubCase("canopen lwa4p (socketcand)", "canopen", canopen_drives.HUB, canopen_drives.armed),
+    VirtualCase("canopen lwa4p (virtual)", "canopen", canopen_drives.VIRTUAL, canopen_drives.armed),
 )
 
 

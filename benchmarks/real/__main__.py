@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
@@ -33,17 +35,7 @@ SCALE = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "N": (1.0, "N"), "Nm": (1.0, "N
               help="Judge the model with stand-ins, not accusations alone.")  # fmt: skip
 @click.option("--json", "file", type=click.Path(path_type=Path), default=None,
               help="Write the outcomes.")  # fmt: skip
-def main(
-    folders: tuple[Path, ...],
-    names: str | None,
-    split: str | None,
-    carried: bool,
-    command: str,
-    draw: int,
-    poses: int | None,
-    stand_ins: bool,
-    file: Path | None,
-) -> None:
+def main(folders: tuple[Path, ...], file: Path | None, **values: Any) -> None:
     """Judge the diagnosis on rows that its fit did not see, beside plain least squares.
 
     Public sets are converted by ``python -m benchmarks.real.convert``.
@@ -51,29 +43,8 @@ def main(
     console = Console()
     if not console.is_terminal:
         console.width = 190
-    found: dict[str, Path] = {}
-    for folder in folders:
-        if not folder.is_dir():
-            console.print(f"{folder}: skipped, there is no such folder")
-            continue
-        found |= {p.parent.name: p.parent for p in sorted(folder.glob("*/log.csv"))}
-    wanted = set(names.split(",")) if names else None
-
-    def chosen(name: str) -> bool:
-        own = SPLIT.get(name.rpartition(" > ")[2], "held back")
-        return (wanted is None or name in wanted) and (split is None or own == split)
-
-    program = Program(command, stand_ins)
-    jobs: list[tuple[str, Iterable[Outcome]]] = []
-    jobs += [(name, judge_log(found[name], program, draw, poses))
-             for name in found if chosen(name)]  # fmt: skip
-    for first in dict.fromkeys(a for a, _ in CARRIED) if carried and poses is None else ():
-        later = [found[b] for a, b in CARRIED
-                 if a == first and {a, b} <= set(found) and chosen(f"{a} > {b}")]  # fmt: skip
-        if later:
-            jobs.append((f"{first} > ", judge_carried(found[first], later, program)))
     outcomes: list[Outcome] = []
-    for name, job in jobs:
+    for name, job in _jobs(_logs_in(folders, console), _Options(**values)):
         try:
             for outcome in job:
                 console.print(_line(outcome))
@@ -84,6 +55,51 @@ def main(
     if file is not None:
         document = json.dumps([o.document() for o in outcomes], indent=1)
         file.write_text(document, encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class _Options:
+    """Which logs are judged, and how."""
+
+    names: str | None
+    split: str | None
+    carried: bool
+    command: str
+    draw: int
+    poses: int | None
+    stand_ins: bool
+
+    def includes(self, name: str) -> bool:
+        own = SPLIT.get(name.rpartition(" > ")[2], "held back")
+        named = not self.names or name in self.names.split(",")
+        return named and (self.split is None or own == self.split)
+
+
+def _logs_in(folders: tuple[Path, ...], console: Console) -> dict[str, Path]:
+    """Return the folder of each log by its name."""
+    found: dict[str, Path] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            console.print(f"{folder}: skipped, there is no such folder")
+            continue
+        found |= {p.parent.name: p.parent for p in sorted(folder.glob("*/log.csv"))}
+    return found
+
+
+def _jobs(logs: dict[str, Path], options: _Options) -> Iterator[tuple[str, Iterable[Outcome]]]:
+    """Yield name and outcomes of each log, then of those whose answers are carried to others."""
+    program = Program(options.command, options.stand_ins)
+    for name, folder in logs.items():
+        if options.includes(name):
+            yield name, judge_log(folder, program, options.draw, options.poses)
+    if not options.carried or options.poses is not None:
+        return
+    later_of: dict[str, list[Path]] = {}
+    for a, b in CARRIED:
+        if {a, b} <= set(logs) and options.includes(f"{a} > {b}"):
+            later_of.setdefault(a, []).append(logs[b])
+    for first, later in later_of.items():
+        yield f"{first} > ", judge_carried(logs[first], later, program)
 
 
 def _line(o: Outcome) -> str:

@@ -23,6 +23,7 @@ from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.clock import SYSTEM
+from gapbridge.drivers.simulated.canopen.machine import Phase
 from gapbridge.drivers.simulated.canopen.server import CanopenServer
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
@@ -74,6 +75,11 @@ def served(profile: str = "cia402", **keys: Any) -> Iterator[DriveArm]:
     arm = DriveArm(profile, **keys)
     with arm.thread:
         yield arm
+
+
+def phases(arm: DriveArm) -> set[Phase]:
+    """Return the phases in which the drives are."""
+    return {drive.axis.machine.phase for drive in arm.server.drives}
 
 
 def settled(driver: CanopenDriver, seconds: float = PATIENCE) -> RobotState:

@@ -1,18 +1,11 @@
 """What the profile does not name never reaches the bus."""
 
 import pytest
-from drive_arm import served
 
 from gapbridge.core.errors import GapbridgeError, WriteError
 from gapbridge.drivers.canopen.master import AllowedFrames
 from gapbridge.drivers.canopen.objects import Address
 from gapbridge.drivers.canopen.profile import read_profile
-
-
-@pytest.fixture
-def arm():
-    with served("cia402") as found:
-        yield found
 
 
 @pytest.fixture

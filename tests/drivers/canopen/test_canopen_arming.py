@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import can
 import numpy as np
 import pytest
-from drive_arm import DriveArm, served, settled
+from drive_arm import DriveArm, phases, settled
 from patience import wait_for
 
 from gapbridge.core.errors import ForeignCommandError, WriteError
@@ -24,22 +22,6 @@ from gapbridge.drivers.simulated.canopen.machine import Phase
 
 INTERPOLATED_POSITION = 7  # a mode of operation
 SWITCHED_ON = {"SWITCHED ON", "OPERATION ENABLED"}
-
-
-@pytest.fixture
-def arm() -> Iterator[DriveArm]:
-    with served("cia402") as found:
-        yield found
-
-
-@pytest.fixture
-def driver(arm: DriveArm) -> Iterator[CanopenDriver]:
-    with arm.driver() as found:
-        yield found
-
-
-def phases(arm: DriveArm) -> set[Phase]:
-    return {drive.axis.machine.phase for drive in arm.server.drives}
 
 
 def read_wrong_when_switched_on(

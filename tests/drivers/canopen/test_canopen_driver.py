@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 
 import can
 import numpy as np
 import pytest
-from drive_arm import DriveArm, follow, read_on, served, setpoint, settled
+from drive_arm import DriveArm, follow, phases, read_on, served, setpoint, settled
 from patience import PATIENCE, wait_for, wait_for_error
 from ports import free_port
 
@@ -24,27 +23,7 @@ from gapbridge.core.errors import (
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.simulated.canopen.machine import Phase
 
-
-@pytest.fixture(params=["cia402", "lwa4p"])
-def arm(request: pytest.FixtureRequest) -> Iterator[DriveArm]:
-    with served(request.param) as found:
-        yield found
-
-
-@pytest.fixture
-def generic() -> Iterator[DriveArm]:
-    with served("cia402") as found:
-        yield found
-
-
-@pytest.fixture
-def driver(generic: DriveArm) -> Iterator[CanopenDriver]:
-    with generic.driver() as found:
-        yield found
-
-
-def phases(arm: DriveArm) -> set[Phase]:
-    return {drive.axis.machine.phase for drive in arm.server.drives}
+BOTH_MODES = pytest.mark.parametrize("arm", ["cia402", "lwa4p"], indirect=True)
 
 
 def node_of(arm: DriveArm, joint: int) -> int:
@@ -54,6 +33,7 @@ def node_of(arm: DriveArm, joint: int) -> int:
 # -- reading and writing --------------------------------------------------------------------------
 
 
+@BOTH_MODES
 def test_setpoints_in_both_modes_bring_the_plant_there_and_release_leaves_it(
     arm: DriveArm,
 ) -> None:
@@ -71,6 +51,7 @@ def test_setpoints_in_both_modes_bring_the_plant_there_and_release_leaves_it(
         assert all(drive.number(0x1016, 1) == 0 for drive in arm.server.drives)
 
 
+@BOTH_MODES
 def test_connecting_reading_and_closing_enable_nothing_and_move_nothing(arm: DriveArm) -> None:
     start = arm.controller.q
     with arm.driver() as driver:
@@ -84,6 +65,7 @@ def test_connecting_reading_and_closing_enable_nothing_and_move_nothing(arm: Dri
     )  # fmt: skip
 
 
+@BOTH_MODES
 def test_arming_holds_the_arm_where_it_stands(arm: DriveArm) -> None:
     with arm.driver() as driver:
         start = np.array(arm.controller.q)
@@ -93,46 +75,46 @@ def test_arming_holds_the_arm_where_it_stands(arm: DriveArm) -> None:
         assert np.abs(start - arm.controller.q).max() < 2e-5
 
 
-def test_it_can_be_armed_released_and_armed_again(generic: DriveArm, driver: CanopenDriver) -> None:
+def test_it_can_be_armed_released_and_armed_again(arm: DriveArm, driver: CanopenDriver) -> None:
     for _ in range(3):
         driver.arm(settled(driver))
-        assert phases(generic) == {Phase.ENABLED}
+        assert phases(arm) == {Phase.ENABLED}
         driver.release()
-        assert phases(generic) == {Phase.SWITCH_ON_DISABLED}
+        assert phases(arm) == {Phase.SWITCH_ON_DISABLED}
 
 
 def test_torque_is_in_newton_metres_with_the_joints_sign(
-    generic: DriveArm, driver: CanopenDriver
+    arm: DriveArm, driver: CanopenDriver
 ) -> None:
-    wanted = np.mean([generic.controller.joint_torque for _ in range(1)], axis=0)
+    wanted = np.mean([arm.controller.joint_torque for _ in range(1)], axis=0)
     found = np.mean([settled(driver).actual_current_as_torque for _ in range(20)], axis=0)
     assert found == pytest.approx(wanted, abs=1.5)
     assert np.abs(found).max() > 5.0
 
 
-def test_setpoints_take_effect_together_at_the_next_sync(generic: DriveArm) -> None:
-    with generic.driver(rate=10.0) as driver:  # so slow that its SYNC may be late on a busy machine
+def test_setpoints_take_effect_together_at_the_next_sync(arm: DriveArm) -> None:
+    with arm.driver(rate=10.0) as driver:  # so slow that its SYNC may be late on a busy machine
         driver.arm(settled(driver))
         state = settled(driver)
         goal = state.actual_q + 0.01
         driver.write_setpoint(setpoint(goal, state))
         time.sleep(0.05)
-        assert np.abs(goal - generic.controller.q).min() > 0.009, "it counted without a SYNC"
+        assert np.abs(goal - arm.controller.q).min() > 0.009, "it counted without a SYNC"
         settled(driver)
-        wait_for(lambda: bool(np.abs(goal - generic.controller.q).max() < 1e-4), "the setpoint")
+        wait_for(lambda: bool(np.abs(goal - arm.controller.q).max() < 1e-4), "the setpoint")
 
 
 def test_a_setpoint_whose_sync_comes_too_late_never_takes_effect(
-    generic: DriveArm, driver: CanopenDriver
+    arm: DriveArm, driver: CanopenDriver
 ) -> None:
     driver.arm(settled(driver))
     state = settled(driver)
-    hold = np.array(generic.controller.q)
+    hold = np.array(arm.controller.q)
     driver.write_setpoint(setpoint(hold + 0.02, state))
     time.sleep(0.1)  # the process stands still, for less than the drives wait for its heartbeat
     for _ in range(5):
         target = settled(driver).target_q
-    assert np.abs(hold - generic.controller.q).max() < 1e-5
+    assert np.abs(hold - arm.controller.q).max() < 1e-5
     assert np.abs(hold - target).max() < 1e-5
     assert driver.take_lapsed(), "the loop must go on from what is in force"
     assert not driver.take_lapsed(), "once"
@@ -160,11 +142,11 @@ class _Failing:
 
 @pytest.mark.parametrize("broken", [1, 6])
 def test_a_part_of_a_setpoint_never_takes_effect(
-    generic: DriveArm, driver: CanopenDriver, broken: int
+    arm: DriveArm, driver: CanopenDriver, broken: int
 ) -> None:
     driver.arm(settled(driver))
     state = settled(driver)
-    hold = np.array(generic.controller.q)
+    hold = np.array(arm.controller.q)
     network = driver.master.network
     real, network.bus = network.bus, _Failing(network.bus, 3, broken)
     with pytest.raises(WriteError, match=r"no buffer space.*3 of 6 out"):
@@ -175,57 +157,57 @@ def test_a_part_of_a_setpoint_never_takes_effect(
     network.bus = real
     for _ in range(5):
         settled(driver)
-    assert np.abs(hold - generic.controller.q).max() < 1e-5
+    assert np.abs(hold - arm.controller.q).max() < 1e-5
     assert driver.writer.reverted > 0
     driver.write_setpoint(setpoint(hold + 0.001, settled(driver)))
 
 
 def test_a_setpoint_that_is_not_finite_or_leaves_the_counts_is_refused(
-    generic: DriveArm, driver: CanopenDriver
+    arm: DriveArm, driver: CanopenDriver
 ) -> None:
     driver.arm(settled(driver))
     state = settled(driver)
     for wrong in (np.full(6, np.nan), np.full(6, 1e6), np.zeros(5)):
         with pytest.raises(WriteError):
             driver.write_setpoint(setpoint(wrong, state))
-    assert np.abs(state.actual_q - generic.controller.q).max() < 1e-4
+    assert np.abs(state.actual_q - arm.controller.q).max() < 1e-4
 
 
 # -- samples --------------------------------------------------------------------------------------
 
 
-def test_a_set_without_one_drives_pdo_is_torn(generic: DriveArm, driver: CanopenDriver) -> None:
+def test_a_set_without_one_drives_pdo_is_torn(arm: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
-    generic.server.mute(node_of(generic, 3))
+    arm.server.mute(node_of(arm, 3))
     words = "10 of 12 TPDOs, without TPDO1 of node 4"
     assert wait_for_error(driver.read_state, InvalidStateError, words)
-    generic.server.unmute()
+    arm.server.unmute()
     settled(driver)
 
 
 @pytest.mark.realtime(limit=0.02)
 @pytest.mark.parametrize(("delay", "count"), [(0.009, 4), (0.024, 4), (0.045, 1)])
 def test_a_pdo_of_the_sync_before_is_never_taken_for_this_ones(
-    generic: DriveArm, driver: CanopenDriver, delay: float, count: int
+    arm: DriveArm, driver: CanopenDriver, delay: float, count: int
 ) -> None:
     torn = 0
     for _ in range(5):
         settled(driver)
-        generic.server.delay_tpdos(node_of(generic, 2), delay, count)
+        arm.server.delay_tpdos(node_of(arm, 2), delay, count)
         for _ in range(6):
             try:
                 state = driver.read_state()
             except (InvalidStateError, StaleStateError):
                 torn += 1
             else:
-                assert np.abs(state.actual_q - generic.controller.q).max() < 1e-3
+                assert np.abs(state.actual_q - arm.controller.q).max() < 1e-3
     assert torn >= 5
 
 
-def test_a_pdo_that_no_sync_asked_for_is_reported(generic: DriveArm, driver: CanopenDriver) -> None:
+def test_a_pdo_that_no_sync_asked_for_is_reported(arm: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
     text, until = "", time.monotonic() + PATIENCE
-    with generic.other_bus() as bus:
+    with arm.other_bus() as bus:
         while "came without a SYNC" not in text and time.monotonic() < until:
             bus.send(can.Message(arbitration_id=0x181, data=bytes(6), is_extended_id=False))
             time.sleep(0.02)  # on a busy machine it may come between a SYNC and its answer
@@ -239,22 +221,22 @@ def test_a_pdo_that_no_sync_asked_for_is_reported(generic: DriveArm, driver: Can
 
 @pytest.mark.parametrize("extended", [True, False])
 def test_frames_of_others_are_no_samples(
-    generic: DriveArm, driver: CanopenDriver, extended: bool
+    arm: DriveArm, driver: CanopenDriver, extended: bool
 ) -> None:
-    with generic.other_bus() as bus:
+    with arm.other_bus() as bus:
         for identifier in (0x181, 0x205) if extended else (0x1F0, 0x190):
             bus.send(can.Message(arbitration_id=identifier, data=bytes(8), is_extended_id=extended))
     state = settled(driver)
-    assert np.abs(state.actual_q - generic.controller.q).max() < 1e-3
+    assert np.abs(state.actual_q - arm.controller.q).max() < 1e-3
     assert driver.foreign is None
 
 
 # -- losses and faults ----------------------------------------------------------------------------
 
 
-def test_a_lost_node_is_stale_and_named(generic: DriveArm, driver: CanopenDriver) -> None:
+def test_a_lost_node_is_stale_and_named(arm: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
-    generic.server.mute(node_of(generic, 4))
+    arm.server.mute(node_of(arm, 4))
     assert wait_for_error(driver.read_state, StaleStateError, "node 5")
 
 
@@ -267,20 +249,20 @@ def test_a_missing_heartbeat_is_stale_though_pdos_come() -> None:
         )
 
 
-def test_a_drive_that_restarts_is_a_lost_link(generic: DriveArm, driver: CanopenDriver) -> None:
+def test_a_drive_that_restarts_is_a_lost_link(arm: DriveArm, driver: CanopenDriver) -> None:
     driver.arm(settled(driver))
-    generic.server.restart(node_of(generic, 0))
+    arm.server.restart(node_of(arm, 0))
     with pytest.raises(LinkError, match="node 1: has restarted"):
         read_on(driver)
     driver.close()
-    assert Phase.ENABLED not in phases(generic)
+    assert Phase.ENABLED not in phases(arm)
 
 
 def test_an_emergency_is_a_fault_that_stops_writing_and_is_named(
-    generic: DriveArm, driver: CanopenDriver
+    arm: DriveArm, driver: CanopenDriver
 ) -> None:
     driver.arm(settled(driver))
-    generic.server.fail(node_of(generic, 2), 0x2310)
+    arm.server.fail(node_of(arm, 2), 0x2310)
     wait_for(lambda: settled(driver).safety_mode == 9, "safety_mode fault")
     state = settled(driver)
     with pytest.raises(WriteError, match=r"node 3: found FAULT.*EMCY 0x2310"):
@@ -288,27 +270,27 @@ def test_an_emergency_is_a_fault_that_stops_writing_and_is_named(
     driver.release()
     with pytest.raises(WriteError, match=r"found FAULT.*clear_faults"):
         driver.arm(settled(driver))
-    assert Phase.ENABLED not in phases(generic)
+    assert Phase.ENABLED not in phases(arm)
 
 
-def test_faults_are_reset_where_the_cell_says_so(generic: DriveArm) -> None:
-    with generic.driver(clear_faults=True) as driver:
-        generic.server.fail(node_of(generic, 2), 0x2310)
-        wait_for(lambda: Phase.FAULT in phases(generic), "a fault")
+def test_faults_are_reset_where_the_cell_says_so(arm: DriveArm) -> None:
+    with arm.driver(clear_faults=True) as driver:
+        arm.server.fail(node_of(arm, 2), 0x2310)
+        wait_for(lambda: Phase.FAULT in phases(arm), "a fault")
         state = settled(driver)
         assert state.safety_mode == 1, "the loop refuses to arm a robot that says it is in fault"
         driver.arm(state)
         assert settled(driver).safety_mode == 1
-        assert phases(generic) == {Phase.ENABLED}
+        assert phases(arm) == {Phase.ENABLED}
 
 
-def test_a_drive_that_cannot_be_enabled_leaves_none_enabled(generic: DriveArm) -> None:
-    with generic.driver(arming_time=0.3, clear_faults=True) as driver:
-        generic.controller.emergency_stop()
+def test_a_drive_that_cannot_be_enabled_leaves_none_enabled(arm: DriveArm) -> None:
+    with arm.driver(arming_time=0.3, clear_faults=True) as driver:
+        arm.controller.emergency_stop()
         state = settled(driver)
         with pytest.raises(WriteError, match="does not follow setpoints"):
             driver.arm(state)
-        assert Phase.ENABLED not in phases(generic)
+        assert Phase.ENABLED not in phases(arm)
 
 
 @pytest.mark.parametrize("refused", ["write", "read"])
@@ -338,17 +320,17 @@ def test_a_drive_that_refuses_an_object_while_arming_leaves_all_as_they_were(
 
 
 def test_drives_stop_by_themselves_when_we_fall_silent(
-    generic: DriveArm, driver: CanopenDriver
+    arm: DriveArm, driver: CanopenDriver
 ) -> None:
     driver.arm(settled(driver))
     state = settled(driver)
     driver.write_setpoint(setpoint(state.actual_q + 0.001, state))
     settled(driver)  # from here on silent, as a process that hangs, or was killed
-    wait_for(lambda: Phase.ENABLED not in phases(generic), "the drives' own stop")
-    wait_for(lambda: not any(generic.controller.qd), "the end of the motion")
-    rest = generic.controller.q
+    wait_for(lambda: Phase.ENABLED not in phases(arm), "the drives' own stop")
+    wait_for(lambda: not any(arm.controller.qd), "the end of the motion")
+    rest = arm.controller.q
     time.sleep(0.1)
-    assert generic.controller.q == rest
+    assert arm.controller.q == rest
 
 
 def test_a_bus_that_dies_is_a_lost_link() -> None:
@@ -377,10 +359,10 @@ def test_a_bus_that_dies_is_a_lost_link() -> None:
     ],
 )
 def test_another_master_is_noticed_and_writing_refused(
-    generic: DriveArm, driver: CanopenDriver, identifier: int, data: bytes, phrase: str
+    arm: DriveArm, driver: CanopenDriver, identifier: int, data: bytes, phrase: str
 ) -> None:
     driver.arm(settled(driver))
-    with generic.other_bus() as bus:
+    with arm.other_bus() as bus:
         bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
         wait_for(lambda: driver.foreign is not None, "the other master's frame")
     state = settled(driver)
@@ -389,23 +371,23 @@ def test_another_master_is_noticed_and_writing_refused(
     driver.release()
 
 
-def test_arming_waits_until_another_master_has_been_quiet(generic: DriveArm) -> None:
-    with generic.driver(foreign_quiet=0.4) as driver, generic.other_bus() as bus:
+def test_arming_waits_until_another_master_has_been_quiet(arm: DriveArm) -> None:
+    with arm.driver(foreign_quiet=0.4) as driver, arm.other_bus() as bus:
         time.sleep(0.4)
         bus.send(can.Message(arbitration_id=0x204, data=bytes(6), is_extended_id=False))
         wait_for(lambda: driver.foreign is not None, "the other master's frame")
         with pytest.raises(ForeignCommandError, match="found two masters"):
             driver.arm(settled(driver))
-        assert Phase.ENABLED not in phases(generic)
+        assert Phase.ENABLED not in phases(arm)
         time.sleep(0.4)
         driver.arm(settled(driver))
 
 
-def test_a_bus_with_a_master_on_it_is_not_joined(generic: DriveArm) -> None:
-    with generic.other_bus() as bus:
+def test_a_bus_with_a_master_on_it_is_not_joined(arm: DriveArm) -> None:
+    with arm.other_bus() as bus:
         task = bus.send_periodic(can.Message(arbitration_id=0x80, is_extended_id=False), 0.01)
         with pytest.raises(LinkError, match="another master sent SYNC"):
-            generic.driver().connect()
+            arm.driver().connect()
         task.stop()
 
 
@@ -425,27 +407,27 @@ def test_a_bus_that_is_not_served_is_reported_soon() -> None:
         arm.driver().connect()
 
 
-def test_units_that_cannot_be_are_refused_when_connecting(generic: DriveArm) -> None:
-    driver = generic.driver()
+def test_units_that_cannot_be_are_refused_when_connecting(arm: DriveArm) -> None:
+    driver = arm.driver()
     driver.profile.counts_per_radian[2] *= 20.0
     with pytest.raises(LinkError, match=r"node 3: found software position limits .*joint 3"):
         driver.connect()
 
 
-def test_a_device_that_is_no_drive_is_refused(generic: DriveArm) -> None:
-    generic.server.drives[0].data_store[0x1000] = {0: (401).to_bytes(4, "little")}
+def test_a_device_that_is_no_drive_is_refused(arm: DriveArm) -> None:
+    arm.server.drives[0].data_store[0x1000] = {0: (401).to_bytes(4, "little")}
     with pytest.raises(LinkError, match="node 1: found device profile 401, expected 402"):
-        generic.driver().connect()
+        arm.driver().connect()
 
 
-def test_a_mode_that_a_drive_lacks_is_refused(generic: DriveArm) -> None:
-    generic.server.drives[5].data_store[0x6502] = {0: (1).to_bytes(4, "little")}
+def test_a_mode_that_a_drive_lacks_is_refused(arm: DriveArm) -> None:
+    arm.server.drives[5].data_store[0x6502] = {0: (1).to_bytes(4, "little")}
     with pytest.raises(LinkError, match="node 6: found supported drive modes 0x1"):
-        generic.driver().connect()
+        arm.driver().connect()
 
 
-def test_fixed_pdos_that_are_others_are_refused(generic: DriveArm) -> None:
-    driver = generic.driver()
+def test_fixed_pdos_that_are_others_are_refused(arm: DriveArm) -> None:
+    driver = arm.driver()
     object.__setattr__(driver.profile.file, "pdo_setup", "check")
     with pytest.raises(LinkError, match=r"node 1: TPDO1 maps 0x6041, expected 0x6041, 0x6064"):
         driver.connect()
@@ -457,12 +439,12 @@ def test_a_rate_that_the_drives_cannot_keep_is_refused(rate: float, phrase: str)
         DriveArm("cia402").driver(rate=rate)
 
 
-def test_closing_an_armed_driver_switches_the_drives_off(generic: DriveArm) -> None:
-    driver = generic.driver()
+def test_closing_an_armed_driver_switches_the_drives_off(arm: DriveArm) -> None:
+    driver = arm.driver()
     driver.connect()
     driver.arm(settled(driver))
     driver.close()
     driver.close()
-    assert phases(generic) == {Phase.SWITCH_ON_DISABLED}
+    assert phases(arm) == {Phase.SWITCH_ON_DISABLED}
     with pytest.raises(LinkError):
         driver.read_state()

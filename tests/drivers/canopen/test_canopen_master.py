@@ -10,7 +10,7 @@ from typing import Any
 import canopen
 import pytest
 from canopen.profiles.p402 import BaseNode402
-from drive_arm import DriveArm, served
+from drive_arm import DriveArm
 from patience import PATIENCE, wait_for
 
 from gapbridge.drivers.canopen.settings import CanopenSettings
@@ -58,12 +58,6 @@ def master(arm: DriveArm) -> Iterator[tuple[Any, BaseNode402]]:
     finally:
         network.sync.stop()
         network.disconnect()
-
-
-@pytest.fixture
-def arm() -> Iterator[DriveArm]:
-    with served("cia402") as found:
-        yield found
 
 
 def test_the_librarys_master_enables_moves_and_disables_a_drive(arm: DriveArm) -> None:
