@@ -52,6 +52,10 @@ class ReadingError(Exception):
 class ArmMovedError(ReadingError):
     """The arm has left where its joints were sampled, or may have: they are sampled again."""
 
+    def __init__(self, message: str, source: str) -> None:
+        super().__init__(message)
+        self.source = source  # of the reading that is discarded, as Samples.source
+
 
 class Instrument(ABC, Generic[S]):
     """One instrument; not thread-safe. The constructor opens nothing."""

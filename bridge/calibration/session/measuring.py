@@ -58,7 +58,7 @@ def capture(
     if joint_sample is None:
         joint_sample = joints.sample_at_rest(pose)
     else:
-        _require_unmoved(joints, joint_sample)
+        _require_unmoved(joints, joint_sample, samples.source)
     if instrument.needs_wrench and joint_sample.raw_wrench is None:
         raise LinkError("the controller sends no ft_raw_wrench, expected a force sensor's reading")
     values = samples.values
@@ -72,14 +72,14 @@ def capture(
     return CapturedReading(joint_sample, mean(values), std, spread, len(values), samples.source)
 
 
-def _require_unmoved(joints: JointSource, sample: JointSample) -> None:
+def _require_unmoved(joints: JointSource, sample: JointSample, source: str) -> None:
     """Raise ArmMovedError if the arm has moved since the sample, or that is unknown."""
     try:
         unmoved = joints.unmoved_since(sample)
     except ReadingError as error:
-        raise ArmMovedError(str(error)) from error
+        raise ArmMovedError(str(error), source) from error
     if not unmoved:
-        raise ArmMovedError("the arm moved while it was measured")
+        raise ArmMovedError("the arm moved while it was measured", source)
 
 
 def mean(values: Array) -> Array:
@@ -178,6 +178,10 @@ class Measuring:
                 break
             except ReadingError as error:
                 self.prompt.warn(str(error))
+                if isinstance(error, ArmMovedError):  # of elsewhere: its row is not read again
+                    self.session.add(
+                        "rejected", stop=stop, source=error.source, reasons=[str(error)]
+                    )
                 if not self.instrument.manual:
                     self.prompt.enter("  Enter to try again")
                 if not self.instrument.manual or isinstance(error, ArmMovedError):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.instruments.instrument import (
+    AnyInstrument,
     InstrumentContext,
     ReadRequest,
     Samples,
@@ -122,7 +123,7 @@ def session_of(stops: int) -> Session:
 
 
 def measuring(
-    session: Session, prompt: Prompt, joints: JointSource, instrument: TypedCoordinates
+    session: Session, prompt: Prompt, joints: JointSource, instrument: AnyInstrument
 ) -> Measuring:
     """Return what measures the session, in a cell without obstacles."""
     positioning = Positioning(

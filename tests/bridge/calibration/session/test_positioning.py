@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scripted_positioning import (
@@ -13,8 +15,10 @@ from scripted_positioning import (
     session_of,
 )
 
-from gapbridge.bridge.calibration.instruments.instrument import ReadingError
+from gapbridge.bridge.calibration.instruments.files import ReadingsFile
+from gapbridge.bridge.calibration.instruments.instrument import InstrumentContext, ReadingError
 from gapbridge.bridge.calibration.joints.joint_source import JointSample
+from gapbridge.bridge.cell.settings.instruments import FileSettings
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import LinkError, RunError
 
@@ -89,6 +93,27 @@ def test_a_reading_is_typed_again_where_the_link_was_silent(
 
     monkeypatch.setattr(arm, "unmoved_since", unmoved)
     measuring(session, ScriptedPrompt(), arm, Tracker(manual=True)).run()
+    np.testing.assert_array_equal(session.accepted[0].q, arm.q)
+
+
+def test_a_row_that_was_written_while_the_arm_moved_is_not_read_again(tmp_path: Path) -> None:
+    arm, session, file = ScriptedJoints(np.full(6, 0.1)), session_of(1), tmp_path / "readings.csv"
+    file.write_text("x,y,z\n1000,2000,300\n", encoding="utf-8")
+    settings = FileSettings(kind="file", file=file, unit="mm", timeout=0.01)
+    instrument = ReadingsFile(settings, InstrumentContext(lambda question: ""))
+
+    class Measured(ScriptedPrompt):
+        def enter(self, question: str) -> None:  # to try again: the tracker measures once more
+            with file.open("a", encoding="utf-8") as rows:
+                rows.write("1000.2,2000,300\n")
+
+    def unmoved(sample: JointSample) -> bool:
+        before, arm.q = sample.q, np.full(6, 0.1004)
+        return bool((before == arm.q).all())
+
+    arm.unmoved_since = unmoved  # type: ignore[method-assign]
+    measuring(session, Measured(), arm, instrument).run()
+    np.testing.assert_allclose(session.accepted[0].value, [1.0002, 2.0, 0.3])
     np.testing.assert_array_equal(session.accepted[0].q, arm.q)
 
 
