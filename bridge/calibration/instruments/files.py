@@ -61,7 +61,7 @@ class Table:
             )
         cells = row.cells[-count:] if columns is None else self._select(row, columns)
         try:
-            return parse_numbers(";".join(cells), count, settings.unit)
+            return parse_numbers(";".join(cells), count, *settings.units)
         except ReadingError as error:
             raise ReadingError(f"{self.path}: row {row.line}: {error}") from None
 

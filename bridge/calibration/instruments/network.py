@@ -60,7 +60,7 @@ class LineFeed(Instrument[LineFeedSettings]):
                 if settings.trigger:
                     link.sendall(settings.trigger.encode() + b"\n")
                 line, buffer = self._line(link, buffer)
-                values.append(to_si(parse_numbers(line, settings.width, settings.unit), settings))
+                values.append(to_si(parse_numbers(line, settings.width, *settings.units), settings))
         return Samples(np.array(values))
 
     def _line(self, link: socket.socket, buffer: bytes) -> tuple[str, bytes]:

@@ -17,22 +17,25 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z_0-9]*\s*[:=]")  # the label in "X = 12.3"
 _UNIT = re.compile(r"(?<=[\d.,\s])(mm|um|µm|m|in|deg|rad|°)(?=[\s,;]|$)")
 
 
-def parse_numbers(text: str, count: int, unit: str = "") -> list[float]:
+def parse_numbers(text: str, count: int, *units: str) -> list[float]:
     """Return exactly ``count`` finite numbers of a line.
 
     Separators are commas, semicolons, tabs or spaces; decimal commas are accepted with any other
-    separator. A unit in the text must be ``unit``. Raises ReadingError.
+    separator. A unit in the text must be one of ``units``. Raises ReadingError.
     """
     plain = _NAME.sub(" ", text.strip())
     for written in _UNIT.findall(plain):
         standard = {"µm": "um", "°": "deg"}.get(written, written)
-        if unit and standard != unit and standard not in RADIANS:
-            raise ReadingError(f"found {written}, expected {unit}: the unit declared for it")
+        if units and standard not in units:
+            same = [unit for unit in units if (unit in RADIANS) == (standard in RADIANS)]
+            raise ReadingError(
+                f"found {written}, expected {(*same, *units)[0]}: the unit declared for it"
+            )
     plain = _UNIT.sub(" ", plain)
     values = []
     for token in _tokens(plain, count):
         try:
-            values.append(float(token))
+            values.append(float(token.replace("_", "x")))  # Python reads 1_0 as 10
         except ValueError:
             raise ReadingError(f"found {token!r}, expected a number") from None
     if len(values) != count:

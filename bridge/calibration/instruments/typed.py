@@ -40,7 +40,7 @@ class TypedCoordinates(_TypedReading[TypedSettings]):
         settings = self.settings
         names = "x y z" if not settings.pose else f"x y z and {settings.rotation}"
         line = self.context.ask(f"{names}, {settings.unit}")
-        return Samples(to_si(parse_numbers(line, settings.width, settings.unit), settings)[None])
+        return Samples(to_si(parse_numbers(line, settings.width, *settings.units), settings)[None])
 
 
 class DialGauge(_TypedReading[DialGaugeSettings]):

@@ -57,6 +57,12 @@ class Coordinates(Base):
         return "pose" if self.pose else "position"
 
     @property
+    def units(self) -> tuple[str, ...]:
+        """Return the units that its numbers have: of lengths, then of angles if it reads any."""
+        angles = self.pose and self.rotation != "quaternion"
+        return (self.unit, self.angle_unit) if angles else (self.unit,)
+
+    @property
     def width(self) -> int:
         """Return the count of numbers in a reading."""
         if not self.pose:

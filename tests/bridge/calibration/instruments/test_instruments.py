@@ -26,11 +26,12 @@ from gapbridge.bridge.calibration.instruments.instrument import (
     ReadRequest,
 )
 from gapbridge.bridge.calibration.instruments.numbers import parse_numbers
+from gapbridge.bridge.calibration.joints.joint_source import TypedJoints
 from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
 from gapbridge.bridge.demo.links.link import free_address
 from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
 from gapbridge.bridge.demo.processes import ServedCell
-from gapbridge.core.calibration.plan import Payload
+from gapbridge.core.calibration.plan import Payload, PlannedPose
 from gapbridge.core.errors import InputError, LinkError
 
 SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
@@ -70,6 +71,8 @@ def test_a_point_is_understood_however_it_is_written(line: str) -> None:
         ("1 2 x", "found 'x', expected a number"),
         ("1 2 nan", "expected finite numbers"),
         ("1 m 2 m 3 m", "found m, expected mm"),
+        ("1 deg 2 3", "found deg, expected mm"),
+        ("1_0 2 3", "found '1_0', expected a number"),
         ("", "found 0 numbers"),
         ("1e9 2 3", "is the unit right?"),
     ],
@@ -101,6 +104,21 @@ def test_a_pose_is_the_same_however_its_rotation_is_reported(
 ) -> None:
     reader = instrument("typed", line, unit="m", pose=True, **keys).read(ReadRequest()).values[0]
     np.testing.assert_allclose(reader, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("unit", "line"), [("deg", "1 2 3 0 0 1.5 rad"), ("rad", "1 m 2 m 3 m 0 0 1°")]
+)
+def test_an_angle_with_another_unit_is_refused(unit: str, line: str) -> None:
+    reader = instrument("typed", line, unit="m", pose=True, angle_unit=unit)
+    with pytest.raises(ReadingError, match=f"expected {unit}: the unit declared for it"):
+        reader.read(ReadRequest())
+
+
+def test_joints_typed_in_radians_by_name_are_refused() -> None:
+    joints = TypedJoints(lambda question: "0.5 rad 0.1 rad -1.2 rad")
+    with pytest.raises(ReadingError, match="found rad, expected deg"):
+        joints.sample_at_rest(PlannedPose(0, np.zeros(3), 0, np.zeros(3)))
 
 
 def test_degrees_declared_as_radians_are_refused() -> None:
