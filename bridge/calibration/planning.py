@@ -71,9 +71,14 @@ def loads_of(cell: Cell) -> tuple[Payload, ...]:
     """Return the loads of the session; default: the cell's payload alone."""
     entries = cell.calibration.loads
     if not entries:
-        payload = cell.file.payload
-        return (Payload(payload.mass, _vector3(payload.cog), "as in the cell"),)
+        return (own_load(cell, "as in the cell"),)
     return tuple(Payload(e.mass, _vector3(e.cog), e.name) for e in entries)
+
+
+def own_load(cell: Cell, name: str) -> Payload:
+    """Return the cell's payload under a name: what the arm carries in a short session."""
+    payload = cell.file.payload
+    return Payload(payload.mass, _vector3(payload.cog), name)
 
 
 def make_plan(cell: Cell, options: SessionOptions, emit: Callable[[str, float], None]) -> Plan:

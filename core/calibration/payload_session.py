@@ -28,6 +28,11 @@ NAMES = ("payload_mass", *(f"payload_cog_{k}" for k in "xyz"), *(f"{BIAS}_{k}" f
 UNITS = ("kg", "m", "m", "m", "N", "N", "N", "Nm", "Nm", "Nm")
 MIN_MASS_SIGMAS = 3.0  # below it the centre of gravity is undetermined
 MIN_READINGS = 3
+MAX_NOISE = (
+    10.0,
+    1.0,
+)  # N, Nm, 1 sigma of a reading about load and bias: no sensor at rest has more
+NOISE_SHARE = 0.1  # the same of the readings' change from pose to pose, for heavy loads
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,7 @@ def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibrati
     flat, value = columns.reshape(-1, 10), wrench.reshape(-1)
     unit = np.tile(np.repeat([0, 1], 3), len(q))  # separate noise of forces and torques
     fit = robust_fit(flat, value, unit, row=np.repeat(np.arange(len(q)), 6))
+    _require_consistent(wrench, fit.noise)
     covariance, cog = _in_terms_of_cog(fit.values, fit.covariance)
     mass = float(fit.values[0])
     values = np.concatenate([[mass], cog, fit.values[4:]])
@@ -125,6 +131,24 @@ def _check_shapes(model: Model, q: Array, wrench: Array) -> None:
             f"payload session: found {len(q)} reading(s), expected {MIN_READINGS} or more "
             "orientations"
         )
+
+
+def _require_consistent(wrench: Array, noise: Array) -> None:
+    """Raise InputError where no load and bias give such readings: they would weigh nothing."""
+    if (wrench == wrench[0]).all():
+        raise InputError(
+            "payload session: found the same wrench in every orientation, expected a sensor whose "
+            "reading turns with gravity: is it connected, and ft_raw_wrench what it reads?"
+        )
+    for i, unit in enumerate(("N", "Nm")):
+        change = float(np.sqrt(wrench[:, 3 * i : 3 * i + 3].var(axis=0).mean()))
+        limit = max(MAX_NOISE[i], NOISE_SHARE * change)
+        if noise[i] > limit:
+            raise InputError(
+                f"payload session: found readings {noise[i]:.3g} {unit} (1 sigma) from those of "
+                f"any load and bias, expected at most {limit:.3g} {unit}: axes, signs or units of "
+                "the sensor are not those of a log (flange axes, N, Nm), or something touched it"
+            )
 
 
 def _require_rotation(columns: Array, count: int) -> None:

@@ -23,6 +23,7 @@ from gapbridge.core.notes import Note, Reason
 NAMES = tuple(f"tool_tcp_{k}" for k in "xyz")
 MIN_READINGS = 3
 MIN_ROTATION = 0.15  # rad, about: spread of orientations that determines the tool
+MAX_NOISE = 5e-3  # m, 1 sigma of one coordinate of a touch
 ROUNDS = 30
 CONVERGED = 1e-10  # m
 
@@ -53,8 +54,9 @@ class ToolCalibration:
 def calibrate_tool(model: Model, q: Array, loads: Loads | None = None) -> ToolCalibration:
     """Return the tool centre point from joint angles ``q`` (N, n), rad, of the touches.
 
-    Outliers are down-weighted and listed. Raises InputError where the angles do not fit the arm,
-    ExcitationError where the orientations do not determine the tool.
+    Outliers are down-weighted and listed. Raises InputError where the angles do not fit the arm, or
+    the touches are not of one point, ExcitationError where the orientations do not determine the
+    tool.
     """
     q = np.asarray(q, dtype=float)
     _check_shapes(model, q)
@@ -63,6 +65,12 @@ def calibrate_tool(model: Model, q: Array, loads: Loads | None = None) -> ToolCa
     point = _common_point(position, rotation, nominal)
     before = np.concatenate([nominal, point])
     values, fit = _fit_tip(position, rotation, before)
+    if fit.noise[0] > MAX_NOISE:
+        raise InputError(
+            f"tool session: found touches {1e3 * fit.noise[0]:.1f} mm (1 sigma of a coordinate) "
+            f"from one common point, expected at most {1e3 * MAX_NOISE:g} mm: was the point moved, "
+            "did the tip slip, are joints mistyped, or is the arm not calibrated?"
+        )
     std = np.sqrt(np.diag(fit.covariance))[:3]
     estimates = tuple(
         Estimate(name, float(v), float(s), "m", freedom=fit.freedom)

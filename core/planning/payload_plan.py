@@ -11,6 +11,7 @@ from gapbridge.core.calibration.payload_session import NAMES, weight_columns
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
 from gapbridge.core.planning.travel import ordered_poses
+from gapbridge.core.planning.workspace import Workspace
 
 WRIST_JOINTS = 3  # last joints, which turn the flange with little motion of the arm
 CANDIDATES = 600
@@ -40,16 +41,19 @@ def plan_payload(
     poses: int | None = None,
     noise: tuple[float, float] = TYPICAL_NOISE,
     seed: int = 0,
+    workspace: Workspace | None = None,
 ) -> PayloadPlan:
     """Return poses around ``begin`` (n,) rad that separate load and sensor bias best (D-optimal).
 
-    Only the last three joints move, within their limits. The expected payload is the model's;
-    ``noise`` is 1 sigma of one axis of an averaged reading (N, Nm). With ``poses`` None, the number
-    is the smallest (6 to 20) that determines mass to 20 g and the centre of gravity to 2 mm. Raises
-    ExcitationError where the limits leave no orientations that separate load from bias.
+    Only the last three joints move, within their limits and those of the ``workspace``, whose
+    obstacles the arm does not hit (except what it hits by its coarse shape at ``begin``). The
+    expected payload is the model's; ``noise`` is 1 sigma of one axis of an averaged reading (N,
+    Nm). With ``poses`` None, the number is the smallest (6 to 20) that determines mass to 20 g and
+    the centre of gravity to 2 mm. Raises ExcitationError where limits and obstacles leave no
+    orientations that separate load from bias.
     """
     begin = np.asarray(begin, dtype=float)
-    candidates = _candidates(model, begin, np.random.default_rng(seed))
+    candidates = _candidates(model, begin, np.random.default_rng(seed), workspace)
     sigma = np.repeat(noise, 3)
     columns = weight_columns(model, candidates) / sigma[None, :, None]
     # the centre of gravity itself, at about this mass
@@ -65,23 +69,29 @@ def plan_payload(
             break
     if not np.isfinite(std).all():
         raise ExcitationError(
-            "payload session: within the joint limits the wrist cannot turn the flange far enough "
-            "to separate load from sensor bias; begin elsewhere"
+            "payload session: within the joint limits and obstacles the wrist cannot turn the "
+            "flange far enough to separate load from sensor bias; begin elsewhere"
         )
     return PayloadPlan(tuple(ordered_poses(candidates[chosen], begin)), std)
 
 
-def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
+def _candidates(
+    model: Model, begin: Array, rng: np.random.Generator, workspace: Workspace | None
+) -> Array:
     n = model.arm.n
     free = np.arange(max(n - WRIST_JOINTS, 0), n)
-    limits = model.arm.limits
+    limits = model.arm.limits if workspace is None else workspace
     # a joint that hardly turns, or not within half a turn of zero, stays at an allowed angle
     margin = np.minimum(LIMIT_MARGIN, (limits.upper - limits.lower) / 2)
     lower, upper = limits.lower + margin, limits.upper - margin
     low, high = np.clip(-np.pi, lower, upper), np.clip(np.pi, lower, upper)
     candidates = np.tile(begin, (CANDIDATES, 1))
     candidates[1:, free] = rng.uniform(low[free], high[free], (CANDIDATES - 1, len(free)))
-    return candidates
+    if workspace is None:
+        return candidates
+    hits = np.array(list(workspace.rejections(candidates).values()))
+    hits &= ~hits[:, :1]
+    return candidates[~hits.any(axis=0)]
 
 
 def select_d_optimal(columns: Array, count: int, first: int | None = None) -> list[int]:
@@ -91,7 +101,7 @@ def select_d_optimal(columns: Array, count: int, first: int | None = None) -> li
     """
     information = 1e-6 * np.eye(columns.shape[2])
     chosen: list[int] = []
-    for _ in range(count):
+    for _ in range(min(count, len(columns))):
         root = np.linalg.inv(information)
         inner = np.einsum("cip,pq,cjq->cij", columns, root, columns)
         gain = np.linalg.slogdet(np.eye(columns.shape[1]) + inner)[1]

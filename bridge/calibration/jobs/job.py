@@ -14,13 +14,13 @@ import numpy as np
 from gapbridge.bridge.calibration.instruments import INSTRUMENTS
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, InstrumentContext
 from gapbridge.bridge.calibration.options import SessionOptions
-from gapbridge.bridge.calibration.planning import effects_of, loads_of, metrology_of
+from gapbridge.bridge.calibration.planning import effects_of, metrology_of
 from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.saving import cell_text
-from gapbridge.bridge.cell.verification_mark import remove_mark
+from gapbridge.bridge.cell.verification_mark import read_mark, remove_mark, write_mark
 from gapbridge.bridge.document.notes import note_text, short_text
 from gapbridge.bridge.document.output_file import require_writable, write_table, write_together
 from gapbridge.bridge.document.provenance import provenance
@@ -65,10 +65,11 @@ class Job(ABC):
 
     def reading_check(self) -> ReadingCheck | None:
         """Return the check of each reading; None: readings are not checked one by one."""
-        metrology = metrology_of(self.cell, self.options.instrument)
+        metrology, plan = metrology_of(self.cell, self.options.instrument), self.session.plan
+        assert plan is not None
         return ReadingCheck(
             self.cell.model, metrology, self.options.instrument.measures, metrology.sigma,
-            effects_of(self.cell), loads_of(self.cell), self.options.instrument.options,
+            effects_of(self.cell), plan.loads, self.options.instrument.options,
         )  # fmt: skip
 
     @abstractmethod
@@ -126,6 +127,9 @@ class Job(ABC):
         write_together({**beside, target: text})
         if baseline is not None:
             remove_mark(target)  # of the calibration that was replaced
+        elif failed := read_mark(cell.path):  # the new cell has the same arm
+            mark = write_mark(target, failed, self.folder)
+            prompt.warn(f"{mark}: written, as the verification of {cell.path} failed")
         # last: a session that could not write all of it has not ended
         self.session.add("ended", applied=str(target.resolve()))
         prompt.say(f"{target}: written", "bold")

@@ -15,7 +15,7 @@ from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, I
 from gapbridge.bridge.calibration.instruments.joint_only import FlangeSensor, PointContact
 from gapbridge.bridge.calibration.jobs.job import Job, short_plan
 from gapbridge.bridge.calibration.options import SessionOptions
-from gapbridge.bridge.calibration.planning import loads_of
+from gapbridge.bridge.calibration.planning import own_load, with_loads, workspace_of
 from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
@@ -23,8 +23,13 @@ from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.settings.instruments import Base, PointSettings
 from gapbridge.bridge.document.notes import note_text
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.payload_session import NAMES, UNITS, calibrate_payload
-from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from gapbridge.core.calibration.payload_session import (
+    NAMES,
+    UNITS,
+    PayloadCalibration,
+    calibrate_payload,
+)
+from gapbridge.core.calibration.plan import Expectation, Plan, PlannedPose
 from gapbridge.core.calibration.tool_session import calibrate_tool
 from gapbridge.core.notes import Reason
 from gapbridge.core.planning.payload_plan import plan_payload
@@ -32,6 +37,7 @@ from gapbridge.core.planning.tool_plan import plan_tool
 from gapbridge.core.rotation import roll_pitch_yaw
 
 POSES = 6
+MIN_DECLARED = 0.3  # kg, of a cell, that a sensor does not overlook
 
 
 class _ShortJob(Job):
@@ -71,7 +77,8 @@ class ToolJob(_ShortJob):
         result = plan_tool(
             self.cell.model, begin, poses=self.options.poses or POSES, seed=self.options.seed
         )
-        return short_plan(loads_of(self.cell)[:1], _planned_poses(result.poses), result.bought)
+        load = own_load(self.cell, "the tool, as in the cell")  # not a load of a calibration
+        return short_plan((load,), _planned_poses(result.poses), result.bought)
 
     def report_plan(self, plan: Plan) -> None:
         """Print the number of contacts and the expected accuracy of the TCP."""
@@ -120,12 +127,12 @@ class PayloadJob(_ShortJob):
     def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
         """Return orientations of the flange about the present pose."""
         assert begin is not None
-        nominal = self.cell.file.payload
-        x, y, z = nominal.cog
-        load = Payload(nominal.mass, (x, y, z), "to be identified; declared")
+        load = own_load(self.cell, "to be identified; declared")
+        workspace = with_loads(workspace_of(self.cell, "position"), [load])
         result = plan_payload(
-            self.cell.model, begin, poses=self.options.poses, seed=self.options.seed
-        )
+            self.cell.model, begin, poses=self.options.poses, seed=self.options.seed,
+            workspace=workspace,
+        )  # fmt: skip
         expected = Expectation(
             NAMES, UNITS, result.std, np.full(len(result.std), np.nan), np.nan, np.nan
         )
@@ -153,11 +160,23 @@ class PayloadJob(_ShortJob):
             for e in result.estimates
         ]
         self.report_short(result, lines, ("the force sensor of the flange", "wrench"))
-        negative = [note for note in result.notes if note.reason is Reason.NEGATIVE_MASS]
-        if negative:
+        if why := self._why_not(result):
             self.session.add("ended", applied=None)
-            self.prompt.warn(f"nothing is applied: {note_text(negative[0])}")
+            self.prompt.warn(f"nothing is applied: {why}")
             return
         applied = result.applied(self.cell.model)
         payload = {"mass": applied.payload_mass, "cog": [float(v) for v in applied.payload_cog]}
         self.write_new_cell(applied, "the cell with this load", {"payload": payload})
+
+    def _why_not(self, result: PayloadCalibration) -> str:
+        """Return why the payload is not written; empty: it may be."""
+        declared = self.cell.file.payload.mass
+        for note in result.notes:
+            if note.reason is Reason.NEGATIVE_MASS:
+                return note_text(note)
+            if note.reason is Reason.NOTHING_WEIGHS and declared > MIN_DECLARED:
+                return (
+                    f"the sensor finds no load, the cell declares {declared:g} kg: are its "
+                    "readings raw and in flange axes? A bare flange has payload.mass: 0 in the cell"
+                )
+        return ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,14 @@ from numpy.typing import NDArray
 from benchmarks.blind.arms import ARMS
 from benchmarks.blind.mechanics import stand
 from benchmarks.calibration.drawings import model_of, real_arm, session_at
-from gapbridge.core.calibration.payload_session import calibrate_payload
+from gapbridge.core.calibration.payload_session import calibrate_payload, weight_columns
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
+from gapbridge.core.planning.capsules import Box
 from gapbridge.core.planning.payload_plan import plan_payload
+from gapbridge.core.planning.workspace import Workspace
 
 Array = NDArray[np.float64]
 KIND = ARMS["cobot10"]
@@ -117,6 +120,45 @@ def test_readings_that_are_no_numbers_are_named(model: Model) -> None:
     wrench[2, 1] = np.nan
     with pytest.raises(InputError, match="reading 3"):
         calibrate_payload(model, np.tile(BEGIN, (4, 1)), wrench)
+
+
+@pytest.mark.parametrize(
+    ("fault", "match"),
+    [
+        (lambda wrench, rotation: np.tile(wrench[:1], (len(wrench), 1)), "the same wrench in ev"),
+        (lambda wrench, rotation: wrench[:, [1, 2, 0, 4, 5, 3]], "N .1 sigma. from those of any"),
+        (
+            lambda wrench, rotation: np.einsum(
+                "nij,nkj->nki", rotation, wrench.reshape(-1, 2, 3)
+            ).reshape(-1, 6),
+            "Nm .1 sigma. from those of any load",
+        ),
+    ],
+    ids=["dead", "axes", "base"],
+)
+def test_a_sensor_that_is_dead_or_has_other_axes_is_not_taken_for_a_bare_flange(
+    model: Model, fault: Callable[[Array, Array], Array], match: str
+) -> None:
+    rng = np.random.default_rng(8)
+    q = rng.uniform(KIND.low, KIND.high, (8, 6))
+    load = replace(model, payload_mass=6.0, payload_cog=np.array([0.01, -0.02, 0.08]))
+    weight = weight_columns(load, q)[:, :, :4] @ np.array([6.0, 0.06, -0.12, 0.48])
+    rotation = load.predict(q).rotation @ load.chain().tool_rotation.T
+    with pytest.raises(InputError, match=match):
+        calibrate_payload(load, q, fault(weight + 0.01 * rng.normal(size=(8, 6)), rotation))
+
+
+def test_planned_orientations_hit_no_obstacle_and_keep_to_the_joint_range(model: Model) -> None:
+    limits = model.arm.limits
+    lower = np.where(np.arange(6) == 5, BEGIN[5] - 1.0, limits.lower)
+    wall = Box((-1.0, -2.0, -1.0), (2.0, -0.45, 2.0))
+    workspace = Workspace.of(model, lower=lower, keep_out=[wall])
+    workspace = replace(workspace, loads_end=((0.0, 0.0, 0.2),))
+    anywhere = np.array(plan_payload(model, BEGIN, poses=20).poses)
+    assert not workspace.clear(anywhere).all()
+    planned = np.array(plan_payload(model, BEGIN, poses=20, workspace=workspace).poses)
+    assert len(planned) == 20
+    assert workspace.clear(planned).all()
 
 
 def test_a_bare_flange_weighs_nothing_and_has_no_centre(model: Model) -> None:

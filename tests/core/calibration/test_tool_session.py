@@ -73,6 +73,14 @@ def test_a_slipped_touch_is_listed(model: Model) -> None:
     assert found.tcp == pytest.approx(TRUE_TIP, abs=3e-4)
 
 
+def test_a_point_that_was_moved_is_refused_not_taken_for_an_uncertain_tip(model: Model) -> None:
+    q = np.array(plan_tool(model, BEGIN, poses=6).poses)
+    touched = _touched(model, q, 2e-4, np.random.default_rng(3))
+    touched[3:, 0] += 0.08
+    with pytest.raises(InputError, match=r"touches \d+\.\d mm .* was the point moved"):
+        calibrate_tool(model, touched)
+
+
 def test_one_axis_is_too_little(model: Model) -> None:
     q = np.tile(BEGIN, (6, 1))
     q[:, 5] += np.linspace(-1, 1, 6)

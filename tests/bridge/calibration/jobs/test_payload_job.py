@@ -16,7 +16,7 @@ from gapbridge.bridge.calibration.session.journal import FILE, Journal, read_ent
 from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.session import Reading, Session
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.cell.verification_mark import mark_path, write_mark
+from gapbridge.bridge.cell.verification_mark import mark_path, read_mark, write_mark
 from gapbridge.core.calibration.payload_session import weight_columns
 from gapbridge.core.calibration.plan import Payload, PlannedPose
 from gapbridge.core.errors import RunError
@@ -24,10 +24,10 @@ from gapbridge.core.errors import RunError
 CELL = "robot: {model: ur10e}\nlink: {driver: ur_rtde, host: 192.0.2.1}\n"
 
 
-@pytest.fixture
-def job(tmp_path: Path) -> Iterator[PayloadJob]:
+@pytest.fixture(params=[""])
+def job(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[PayloadJob]:
     """Return the job of a session without readings, which writes new.yaml without asking."""
-    (tmp_path / "cell.yaml").write_text(CELL, encoding="utf-8")
+    (tmp_path / "cell.yaml").write_text(CELL + request.param, encoding="utf-8")
     cell = load_cell(tmp_path / "cell.yaml")
     options = SessionOptions(
         "payload", None, cell.calibration.instrument, new_cell=tmp_path / "new.yaml", yes=True
@@ -75,6 +75,26 @@ def test_a_flange_without_a_load_is_written_as_no_mass(job: PayloadJob, tmp_path
     job.finish()
     payload = load_cell(tmp_path / "new.yaml").file.payload
     assert (payload.mass, payload.cog) == (0.0, [0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("job", ["payload: {mass: 5.0}\n"], indirect=True)
+def test_a_declared_load_that_the_sensor_does_not_find_is_not_taken_away(
+    job: PayloadJob, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    measure(job, 0.002)
+    job.finish()
+    assert "finds no load, the cell declares 5 kg" in " ".join(capsys.readouterr().out.split())
+    assert not (tmp_path / "new.yaml").exists()
+    assert ended(job) == [None]
+
+
+def test_a_cell_made_of_one_whose_verification_failed_is_marked_too(
+    job: PayloadJob, tmp_path: Path
+) -> None:
+    write_mark(job.cell.path, "the zero of joint 5 moved by 10 mrad", job.folder)
+    measure(job, 4.0)
+    job.finish()
+    assert "the zero of joint 5 moved" in read_mark(tmp_path / "new.yaml")
 
 
 def test_a_reversed_sensor_is_reported_and_writes_no_cell(

@@ -33,6 +33,7 @@ def test_the_tip_of_a_new_tool_is_found_and_written_after_a_yes(tmp_path: Path) 
     )
     assert result.code == 0, result.err
     plan = plan_in(session)
+    assert [load.mass for load in plan.loads] == [0.0]  # the cell's payload, not a test load
     tool = np.eye(4)
     tool[:3, 3] = 0.012, -0.008, 0.15
     true = replace(Model(builtin_arm("ur10e")), tool_in_flange=tool)
