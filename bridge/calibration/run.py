@@ -25,7 +25,6 @@ from gapbridge.bridge.calibration.joints.joint_source import JointSource, Planne
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import (
     CONTACT_KINDS,
-    loads_of,
     metrology_of,
     with_loads,
     workspace_of,
@@ -77,6 +76,10 @@ def run_session(cell: Cell, options: SessionOptions) -> None:
         except InputError:
             if not session.has_begun:
                 journal.discard()  # nothing to resume
+            elif session.next_stop is None:
+                prompt.say(
+                    f"the readings in {folder} are kept; to measure anew give another --session"
+                )
             raise
         except LinkError:
             prompt.say(_how_to_resume(cell, options, session))
@@ -168,6 +171,20 @@ def _report_existing_plan(job: Job) -> None:
             job.prompt.warn(f"this session already has a plan: {option} has no effect")
     if job.options.plan_only and job.session.plan is not None:
         job.report_plan(job.session.plan)
+    _warn_of_obstacles(job)
+
+
+def _warn_of_obstacles(job: Job) -> None:
+    """Warn of stops that the cell's obstacles and limits, changed since the plan, do not allow."""
+    stops = [] if job.starts_at_current_pose else job.session.open_stops
+    if stops:
+        is_free = _collision_check(job)(np.array([job.session.stops[i].q for i in stops]))
+        hit = [str(i + 1) for i, free in zip(stops, is_free, strict=True) if not free]
+        if hit:
+            job.prompt.warn(
+                f"planned before the cell's floor, boxes or joint range were changed, and not free "
+                f"of them now: stops {', '.join(hit)}; `skip` them, or begin another --session"
+            )
 
 
 def _report_resumed(prompt: Prompt, session: Session, folder: Path) -> None:
@@ -208,7 +225,8 @@ def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
 
 
 def _collision_check(job: Job) -> CollisionCheck:
-    workspace = with_loads(workspace_of(job.cell, "position"), loads_of(job.cell))
+    assert job.session.plan is not None
+    workspace = with_loads(workspace_of(job.cell, "position"), job.session.plan.loads)
     return lambda q: np.asarray(workspace.clear(q), dtype=float)
 
 

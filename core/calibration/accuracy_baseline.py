@@ -74,16 +74,32 @@ def read_baseline(document: Mapping[str, Any], where: str = "calibration") -> Ac
         parameters, noise = document["parameters"], document["noise"]
         names = tuple(str(p["name"]) for p in parameters)
         covariance = np.array(document["covariance"], dtype=float).reshape(len(names), len(names))
-        return AccuracyBaseline(
+        baseline = AccuracyBaseline(
             str(document["kind"]), names, np.array([float(p["value"]) for p in parameters]),
             covariance, _number(noise["sigma"]), _number(noise["instrument"]),
             _number(noise["turn"]), _number(noise["joint"]),
             _number(document["freedom"], np.inf), _number(document["rms"]),
         )  # fmt: skip
+        _check_numbers(baseline)
     except KeyError as error:
         raise InputError(f"{where}: key {error.args[0]!r}: not found, expected it") from None
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}: found something unusable ({error})") from None
+    return baseline
+
+
+def _check_numbers(baseline: AccuracyBaseline) -> None:
+    """Raise ValueError where nothing can be tested against the baseline's numbers."""
+    covariance = baseline.covariance
+    size = float(np.abs(covariance).max(initial=0.0))
+    if not np.isfinite(size) or np.abs(covariance - covariance.T).max(initial=0.0) > 1e-6 * size:
+        raise ValueError("covariance: expected finite numbers, symmetric")
+    if np.linalg.eigvalsh(covariance).min(initial=0.0) < -1e-6 * size:
+        raise ValueError("covariance: found a negative variance")
+    if len(set(baseline.names)) < len(baseline.names):
+        raise ValueError("parameters: found one twice")
+    if baseline.instrument <= 0.0 or baseline.joint < 0.0 or not baseline.freedom > 0.0:
+        raise ValueError("noise, freedom: expected numbers above 0")
 
 
 def _plain(value: float) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from gapbridge.bridge.calibration.session.session import seconds_left
 from gapbridge.bridge.cell.verification_mark import mark_path, remove_mark, write_mark
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.accuracy_baseline import read_baseline
+from gapbridge.core.calibration.accuracy_baseline import AccuracyBaseline, read_baseline
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.verify import Verification, verify
 from gapbridge.core.errors import InputError, VerificationError
@@ -36,12 +35,13 @@ from gapbridge.core.planning.candidates import sample_candidates
 from gapbridge.core.planning.travel import joint_speed, move_times, shortest_order, spread_rows
 
 POSES = 10
+MIN_POSES = 6  # as --poses: a calibration that few poses do not contradict need not hold
 
 
 class VerifyJob(Job):
     """Compares poses across the workspace, under each load, with the accuracy baseline."""
 
-    def _baseline(self) -> dict[str, Any]:
+    def _baseline(self) -> AccuracyBaseline:
         """Return the accuracy baseline of the calibration. Raises InputError if there is none."""
         path = baseline_path(self.cell.path)
         try:
@@ -56,11 +56,11 @@ class VerifyJob(Job):
             ) from None
         if not isinstance(document, dict):
             raise InputError(f"{path}: found no mapping, expected an accuracy baseline")
-        return document
+        return read_baseline(document, str(path))
 
     def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
         """Return poses far apart from each other, in the order of travel, load by load."""
-        baseline = read_baseline(self._baseline())
+        baseline = self._baseline()
         if baseline.kind != self.options.instrument.measures:
             raise InputError(
                 f"{baseline_path(self.cell.path)}: found a calibration by {baseline.kind}, "
@@ -96,13 +96,19 @@ class VerifyJob(Job):
     def finish(self) -> None:
         """Report whether the calibration is still valid, and what has changed if it is not.
 
-        Raises VerificationError if it is not. New readings set or remove the mark beside
-        the cell; a session that is only evaluated once more does not.
+        Raises VerificationError if it is not, InputError if too few poses were measured. New
+        readings set or remove the mark beside the cell; a session that is only evaluated once more
+        does not.
         """
         prompt, options, folder = self.prompt, self.options, self.folder
         places = self.session.station_count
         metrology = metrology_of(self.cell, options.instrument, places)
         readings = self.session.all_readings(options.instrument.measures)
+        if (count := len(np.unique(readings.pose))) < MIN_POSES:
+            raise InputError(
+                f"verification: found {count} poses measured, expected at least {MIN_POSES}: fewer "
+                "hardly show what has changed; measure them in another --session"
+            )
         with prompt.waiting("comparing"):
             verification = verify(
                 self.cell.model, readings, self._baseline(), metrology,

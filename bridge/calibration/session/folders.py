@@ -59,6 +59,7 @@ def start_entry(cell: Cell, options: SessionOptions) -> dict[str, Any]:
         "cell": str(cell.path.resolve()),
         "arm": cell.arm.name,
         "model": _model_keys(cell),
+        "loads": _loads(cell),
         **_identity(cell),
         "instrument": options.instrument.model_dump(mode="json"),
         "seed": options.seed,
@@ -68,6 +69,11 @@ def start_entry(cell: Cell, options: SessionOptions) -> dict[str, Any]:
 def _model_keys(cell: Cell) -> dict[str, Any]:
     settings = cell.file.model_dump(mode="json")
     return {key: settings[key] for key in FIXED_KEYS}
+
+
+def _loads(cell: Cell) -> list[list[float]]:
+    """Return mass and centre of gravity of the session's loads, lightest first."""
+    return sorted([load.mass, *load.cog] for load in cell.calibration.loads)
 
 
 def _identity(cell: Cell) -> dict[str, str]:
@@ -94,6 +100,13 @@ def check_start(entry: Entry, cell: Cell, options: SessionOptions, folder: Path)
             f"{cell.path}: {changed[0]}: found it changed since the session in {folder} began, "
             "expected the same; for the changed cell begin another with --session"
         )
+    if entry.get("loads", _loads(cell)) != _loads(
+        cell
+    ):  # the readings so far are with the old ones
+        raise InputError(
+            f"{cell.path}: calibration.loads: found them changed since the session in {folder} "
+            "began, expected the same; for other loads begin another with --session"
+        )
     for key, name in (("link", "link"), ("serial", "calibration.serial")):
         before, now = entry.get(key), _identity(cell)[key]
         if before and now and before != now:
@@ -101,7 +114,7 @@ def check_start(entry: Entry, cell: Cell, options: SessionOptions, folder: Path)
                 f"{cell.path}: {name}: found {now!r}, expected {before!r} of the session in "
                 f"{folder}; for another arm begin another with --session"
             )
-    _check_instrument(_instrument_of(entry.get("instrument", {})), options.instrument, folder)
+    _check_instrument(_instrument_of(entry, folder), options.instrument, folder)
 
 
 def _check_instrument(before: InstrumentSettings, now: InstrumentSettings, folder: Path) -> None:
@@ -131,8 +144,13 @@ def _lengths(instrument: InstrumentSettings) -> dict[str, str]:
     return {k: "to be estimated" if v is None else f"{v:.9g} m" for k, v in lengths.items()}
 
 
-def _instrument_of(entry: dict[str, Any]) -> InstrumentSettings:
-    from pydantic import TypeAdapter
+def _instrument_of(entry: Entry, folder: Path) -> InstrumentSettings:
+    from pydantic import TypeAdapter, ValidationError
 
     adapter: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
-    return adapter.validate_python(entry)
+    try:
+        return adapter.validate_python(entry.get("instrument"))
+    except ValidationError:
+        raise InputError(
+            f"{folder / FILE}: instrument: found none that is known, expected that of the session"
+        ) from None

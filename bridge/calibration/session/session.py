@@ -14,6 +14,7 @@ from gapbridge.bridge.calibration.session.plan_document import entry_of, plan_of
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.errors import InputError
 from gapbridge.core.loads import Loads
 
 _VECTORS = ("q", "value", "approach", "temperature", "wrench", "raw_wrench")
@@ -79,10 +80,18 @@ class Session:
 
     @classmethod
     def of(cls, journal: Journal) -> Session:
-        """Return the session of an open journal."""
+        """Return the session of an open journal. Raises InputError if it was changed by hand."""
         session = cls(journal)
-        for entry in journal.entries:
-            session.apply(entry)
+        for row, entry in enumerate(journal.entries, 1):
+            try:
+                if entry["kind"] == "reading" and entry in journal.entries[: row - 1]:
+                    raise ValueError("the same reading twice")
+                session.apply(entry)
+            except (LookupError, TypeError, ValueError):
+                raise InputError(
+                    f"{journal.path}: row {row}: found an entry {entry['kind']!r} that does not "
+                    "fit those before it, expected the journal as the session wrote it"
+                ) from None
         return session
 
     @property
@@ -98,7 +107,7 @@ class Session:
         """Apply an entry of the journal; unknown kinds are ignored."""
         match entry["kind"]:
             case "begun":
-                self.start_entry = entry
+                self.start_entry = {**entry, "time": float(entry["time"])}
             case "plan":
                 self.plan = plan_of(entry["plan"])
             case "reading":
@@ -122,6 +131,13 @@ class Session:
                 self.notes.append(str(entry["text"]))
 
     def _accept(self, reading: Reading) -> None:
+        if self.plan is None:
+            raise ValueError("a reading before the plan")
+        pose, _ = self.plan.poses[reading.stop], self.plan.loads[reading.load]
+        if reading.q.shape != pose.q.shape or not np.isfinite(reading.q).all():
+            raise ValueError("joints of another arm")
+        if any(reading.value.shape != other.value.shape for other in self.accepted[-1:]):
+            raise ValueError("a reading of another kind")
         if self.accepted and reading.time - self.accepted[-1].time > 0.0:
             self.intervals.append(reading.time - self.accepted[-1].time)
         self.accepted.append(reading)

@@ -25,7 +25,7 @@ from scripted_session import (
 from gapbridge.bridge.calibration.jobs import verify as verify_module
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.cell.verification_mark import read_mark
+from gapbridge.bridge.cell.verification_mark import read_mark, write_mark
 from gapbridge.core.errors import RunError
 
 GAUGE = "{kind: dial_gauge, unit: mm}\n  instrument_at: [1, 0, 1]"
@@ -245,6 +245,16 @@ def test_what_a_planned_session_ignores_is_told(clean: tuple[Path, CommandResult
         assert f"this session already has a plan: {option} has no effect" in result.out
 
 
+def test_stops_that_a_later_obstacle_does_not_allow_are_told(tmp_path: Path) -> None:
+    cell, session = write_cell(tmp_path), tmp_path / "s"
+    assert run_calibrate(cell, "--plan-only", "--session", session).code == 0
+    resumed = run_calibrate(cell, "--session", session, lines=["quit"])
+    assert "not free of them now" not in resumed.out
+    cell.write_text(cell.read_text() + "  keep_out: [{lower: [0.3, -2, 0], upper: [2, 2, 2]}]\n")
+    resumed = run_calibrate(cell, "--session", session, lines=["quit"])
+    assert "not free of them now: stops" in " ".join(resumed.out.split())
+
+
 def test_a_session_resumes_only_with_its_own_cell(
     clean: tuple[Path, CommandResult], tmp_path: Path
 ) -> None:
@@ -283,6 +293,23 @@ def test_a_verification_accepts_the_arm_and_detects_a_bent_tool(
         if bend:  # an old session that is evaluated again says nothing of the arm today
             assert run_calibrate(cell, "--verify", "--session", tmp_path / "a").code == 0
             assert "the tool moved by" in read_mark(cell)
+
+
+def test_a_few_poses_neither_pass_a_verification_nor_remove_the_mark(
+    clean: tuple[Path, CommandResult], tmp_path: Path
+) -> None:
+    cell, session = tmp_path / "new.yaml", tmp_path / "s"
+    for name in ("new.yaml", "new.promise.json"):
+        shutil.copy(clean[0] / name, tmp_path / name)
+    write_mark(cell, "the zero of joint 5 moved by 10 mrad", session)
+    assert run_calibrate(cell, "--verify", "--plan-only", "--session", session).code == 0
+    plan = plan_in(session)
+    lines = session_lines(plan, [reading_line(v) for v in _verified(plan, 0.0)])
+    result = run_calibrate(cell, "--verify", "--session", session, lines=lines[:4] + ["skip"] * 7)
+    assert result.code == 2
+    assert "found 3 poses measured, expected at least 6" in result.err
+    assert "to measure anew give another --session" in result.out
+    assert "the zero of joint 5" in read_mark(cell)
 
 
 def test_a_failed_verification_marks_the_cell_even_where_its_files_cannot_be_written(

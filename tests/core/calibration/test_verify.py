@@ -161,6 +161,25 @@ def test_a_document_that_is_none_is_named(calibrated: Calibrated) -> None:
         read_baseline({k: v for k, v in document.items() if k != "noise"}, "calibration.json")
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"freedom": 0.0},
+        {"covariance": np.nan},
+        {"covariance": -1.0},
+        {"noise": {"sigma": None, "instrument": 0.0, "turn": None, "joint": 0.0}},
+    ],
+)
+def test_a_baseline_with_impossible_numbers_is_named(
+    calibrated: Calibrated, damage: dict[str, Any]
+) -> None:
+    document = dict(calibrated[1])
+    if "covariance" in damage:
+        damage = {"covariance": (damage["covariance"] * np.array(document["covariance"])).tolist()}
+    with pytest.raises(InputError, match=r"^calibration.json: found something unusable"):
+        read_baseline({**document, **damage}, "calibration.json")
+
+
 def test_a_curve_at_one_joint_leaves_another_its_flexibility() -> None:
     """Else no command reads a cell with both that `diagnose --apply` wrote."""
     model = model_of(real_arm(ARMS["cobot5"]))

@@ -80,3 +80,19 @@ def test_a_copy_of_the_cell_resumes_it(
     now = cell_of(tmp_path, link, serial, instrument, "copy.yaml")
     assert refusal(before, now) == ""
     assert refusal(now, before) == ""
+
+
+def test_changed_loads_are_refused_in_any_order(tmp_path: Path) -> None:
+    def cell(loads: str) -> Cell:
+        path = tmp_path / "cell.yaml"
+        path.write_text(
+            f"robot: {{model: ur10e}}\ncalibration: {{loads: {loads}}}\n", encoding="utf-8"
+        )
+        return load_cell(path)
+
+    light, heavy = "{mass: 1.0}", "{mass: 9.0, cog: [0.0, 0.0, 0.1]}"
+    before = cell(f"[{light}, {heavy}]")
+    assert "calibration.loads: found them changed" in refusal(before, cell(f"[{light}]"))
+    other = cell(f"[{light}, {heavy.replace('0.1', '0.12')}]")
+    assert "calibration.loads: found them changed" in refusal(before, other)
+    assert refusal(before, cell(f"[{heavy}, {light}]")) == ""

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapbridge.bridge.calibration.session.journal import FILE, Journal, plain, read_entries
+from gapbridge.bridge.calibration.session.journal import (
+    FILE,
+    Entry,
+    Journal,
+    plain,
+    read_entries,
+)
 from gapbridge.bridge.calibration.session.plan_document import entry_of, plan_of
 from gapbridge.bridge.calibration.session.session import Reading, Session
 from gapbridge.bridge.document.notes import note_texts
@@ -79,6 +86,52 @@ def test_a_resumed_session_has_the_state_of_its_journal(tmp_path: Path) -> None:
     readings = resumed.readings("position")
     np.testing.assert_array_equal(readings.held_out, [False, True])
     assert readings.value.shape == (2, 3)
+
+
+def changed(kind: str, **fields: object) -> Callable[[list[Entry]], None]:
+    """Return what gives other fields to the first entry of a kind; None: takes them away."""
+
+    def change(entries: list[Entry]) -> None:
+        entry = next(e for e in entries if e["kind"] == kind)
+        entry |= fields
+        for key in [key for key, value in fields.items() if value is None]:
+            del entry[key]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("row", "change"),
+    [
+        (1, changed("begun", time=None)),
+        (2, changed("plan", plan={})),
+        (3, changed("mounted", load=None)),
+        (4, changed("reading", q=None)),
+        (4, changed("reading", q=["nan"] * 6)),
+        (4, changed("reading", q=[0.0] * 5)),
+        (4, changed("reading", stop=9)),
+        (4, changed("reading", load=7)),
+        (5, changed("reading", value=[1.0, 2.0])),
+        (5, lambda entries: entries.insert(4, entries[3])),
+        (3, lambda entries: entries.pop(1)),  # the plan
+        (3, lambda entries: entries.insert(2, {"kind": "undo", "stop": 0})),
+    ],
+)
+def test_a_journal_that_was_changed_by_hand_is_refused_with_its_row(
+    tmp_path: Path, row: int, change: Callable[[list[Entry]], object]
+) -> None:
+    with Journal(tmp_path) as journal:
+        session = Session.of(journal)
+        session.add("begun", version=1)
+        session.add_plan(small_plan())
+        session.add("mounted", load=0)
+        for stop in (0, 1):
+            session.add("reading", **reading_at(stop).entry())
+    entries = read_entries(tmp_path / FILE)
+    change(entries)
+    (tmp_path / FILE).write_text("".join(json.dumps(e) + "\n" for e in entries))
+    with Journal(tmp_path) as journal, pytest.raises(InputError, match=f"row {row}: found an"):
+        Session.of(journal)
 
 
 def test_readings_after_a_knock_belong_to_the_new_place(tmp_path: Path) -> None:
