@@ -383,13 +383,19 @@ def _confounded_with_level(selection: Selection) -> dict[int, str]:
     return quantity_of
 
 
-def without_gain(selection: Selection, accused: Sequence[int], held_out: HeldOut) -> list[int]:
-    """Return the candidates of effects that do not reduce the held-out gap, the weakest first."""
+def without_gain(
+    selection: Selection, accused: Sequence[int], held_out: HeldOut, *, each: bool = False
+) -> list[int]:
+    """Return the candidates of effects that do not reduce the held-out gap, the weakest first.
+
+    First moments, friction and offsets of all joints count as one effect, of which few rows show
+    only what it gains as a whole; ``each``: every effect has to gain by itself.
+    """
     if not held_out.possible:
         return list(accused)
     remaining, failed = list(accused), []
     while remaining:
-        by_effect = _by_effect(selection, remaining)
+        by_effect = _by_effect(selection, remaining, each)
         low = {
             kind: held_out.shrink(remaining, [c for c in remaining if c not in members]).interval[0]
             for kind, members in by_effect.items()
@@ -402,11 +408,10 @@ def without_gain(selection: Selection, accused: Sequence[int], held_out: HeldOut
     return failed
 
 
-def _by_effect(selection: Selection, chosen: Sequence[int]) -> dict[str, list[int]]:
+def _by_effect(selection: Selection, chosen: Sequence[int], each: bool) -> dict[str, list[int]]:
     by_effect: dict[str, list[int]] = {}
     for c in chosen:
-        # first moments, friction and offsets of all joints gain together only
-        whole = c in selection.block and selection.observation.channel != "position"
+        whole = not each and c in selection.block and selection.observation.channel != "position"
         by_effect.setdefault("" if whole else selection.space.candidates[c].family, []).append(c)
     return by_effect
 

@@ -137,7 +137,9 @@ def accused_on_all_rows(
     }
     selection, judgement = _without(varying, selection, judgement, refits)
     # in the space of all rows a term's position is its candidate
-    failed = without_gain(selection, judgement.accused, held_out) if held_out.possible else []
+    failed: list[int] = []
+    if held_out.possible:
+        failed = without_gain(selection, judgement.accused, held_out, each=True)
     selection, judgement = _without(dict.fromkeys(failed, NO_GAIN), selection, judgement, refits)
     return selection, replace(judgement, ties=ties_of(selection, judgement.accused))
 

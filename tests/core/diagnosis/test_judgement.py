@@ -384,6 +384,22 @@ def test_what_gains_beside_a_withdrawn_term_only_is_withdrawn_too(
     assert reasons.get(1) == (None if 1 in stays else Check.HELD_OUT_GAIN)
 
 
+@pytest.mark.parametrize(("each", "gainless"), [(False, []), (True, [0])])
+def test_of_the_links_every_effect_has_to_gain_by_itself_on_all_rows(each, gainless):
+    """Two first moments of 0.07 kg m that cancel each other were a cause beside all friction."""
+    kinds = [SimpleNamespace(family=f) for f in ("link_cog", "coulomb_friction")]
+    found = SimpleNamespace(
+        block=(0, 1), observation=SimpleNamespace(channel="torque"),
+        space=SimpleNamespace(candidates=kinds),
+    )  # fmt: skip
+
+    def shrink(_, without):
+        return SimpleNamespace(interval=(0.8 if 1 not in without else -0.001, 0.9))
+
+    held_out = SimpleNamespace(possible=True, shrink=shrink)
+    assert judging.without_gain(found, [0, 1], held_out, each=each) == gainless
+
+
 def test_links_that_gain_only_by_what_is_then_held_nominal_are_no_cause(monkeypatch):
     """A column that bends below a Doosan: 42 % by an implausible length, nothing without it."""
     link = SimpleNamespace(effect=effect_named("link_geometry"), family="link_geometry")

@@ -137,6 +137,18 @@ def test_remaining_terms_are_tested_again_after_a_withdrawal(monkeypatch):
     assert selection.terms[0].values == (1e-3, 0.0, 1e-3)
 
 
+def test_on_all_rows_every_effect_has_to_gain_by_itself(monkeypatch):
+    found = OnAllRows((1e-3, 1e-3, 1e-3), (5e-4,))
+    monkeypatch.setattr(all_rows, "not_constant", lambda *_: {})
+    monkeypatch.setattr(all_rows, "ties_of", lambda *_: {})
+    monkeypatch.setattr(all_rows, "without_gain", lambda *_, each=False: [1] if each else [])
+    requested = Judgement((0, 1), True, 0.0, (), {}, ())
+    _, decided = accused_on_all_rows(
+        found, requested, SimpleNamespace(possible=True), each_by_itself(lambda s, _: s)
+    )
+    assert decided.accused == (0,)
+
+
 @pytest.mark.parametrize(("zero", "stays"), [(2.9e-4, (0,)), (3.1e-4, (0, 1))])
 def test_an_undecided_joint_zero_of_the_links_needs_three_sigmas(zero, stays):
     """It has a prior: without it the links of a UR10 stood for 0.57 mrad +- 0.13 mrad."""
