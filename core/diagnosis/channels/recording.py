@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.arrays import Array, Index, Mask
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.derivatives import signal_noise
 from gapbridge.core.diagnosis.criteria import MIN_TORQUE_CHANGE, STEPPED_SHARE
 from gapbridge.core.diagnosis.observation import HELD_TORQUE
@@ -22,6 +22,7 @@ MAX_POSES = 30_000  # poses at rest: limited by memory
 STRETCHES = 24  # conditions of a recording: even stretches of time
 MIN_CONDITIONS = 5
 MIN_TORQUE = 1e-3  # Nm
+CLEAR_CHANGE = 1e-3  # of the largest expected change of the same unit: a reading has to change too
 CONSTANT_SPREAD = 1e-9  # spread below which a quantity counts as constant
 
 
@@ -31,19 +32,40 @@ def subsampled(log: Log, usable: NDArray[np.bool_], motion: Motion) -> Index:
     return rows[drawn(session_of(log)[motion.rows[rows]], MAX_POSES)]
 
 
-def unchanging(log: Log, readings: Array) -> Mask:
-    """Return the rows (N,) of sessions in which none of the ``readings`` (N, k) ever changes.
+def without_dead(
+    log: Log, readings: Array, motion: Motion, alike: int, predict: Callable[[Motion], Array]
+) -> tuple[Array, tuple[str, ...]]:
+    """Return the readings (N, k), NaN in sessions whose sensor is dead, and what is dead.
 
-    So records a sensor that is not there (zeros), or one that stands still.
+    A dead sensor never changes although the arm moves, or gives zeros alone; a dead axis never
+    changes where ``predict``, (M, k) of a motion, changes clearly beside the others of its unit, of
+    which there are ``alike``. An axis is named by its index, the whole sensor by nothing.
     """
-    still = np.zeros(len(log), dtype=bool)
-    finite = np.isfinite(readings).all(axis=1)
-    session = session_of(log)
+    session, finite = session_of(log), np.isfinite(readings).all(axis=1)
+    alive, dead = readings.copy(), set()
     for number in np.unique(session):
-        rows = session == number
-        known = readings[rows & finite]
-        still[rows] = len(known) > 1 and bool((known == known[0]).all())
-    return still
+        rows = np.flatnonzero(finite & (session == number))
+        constant = (readings[rows] == readings[rows[:1]]).all(axis=0)
+        if len(rows) < 2 or not constant.any():
+            continue
+        if constant.all():
+            q = motion.q[np.isin(motion.rows, rows)]
+            axes = [""] if np.any(q != q[:1]) or not readings[rows].any() else []
+        else:
+            here = motion.pick(motion.valid & np.isin(motion.rows, rows))
+            change = np.ptp(predict(here), axis=0) if len(here) else np.zeros(len(constant))
+            units = change.reshape(-1, alike)
+            clear = (units > CLEAR_CHANGE * units.max(axis=1, keepdims=True)).ravel()
+            axes = [f"_{axis}" for axis in np.flatnonzero(constant & clear)]
+        if axes:
+            alive[rows] = np.nan
+            dead |= {*axes}
+    return alive, tuple(sorted(dead))
+
+
+def living(column: str, dead: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what a channel without usable rows needs, given what is ``dead`` of its column."""
+    return tuple(f"{column}{axis} that changes" for axis in dead) or (column,)
 
 
 def conditions(motion: Motion) -> Index:

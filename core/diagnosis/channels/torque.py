@@ -12,10 +12,11 @@ from gapbridge.core.diagnosis.channels.recording import (
     conditions,
     instrument_noise,
     joint_axes,
+    living,
     own_joints,
     quantities,
     subsampled,
-    unchanging,
+    without_dead,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_loads
@@ -37,8 +38,8 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
 
     Rows without derivatives (edges, gaps), with a torque that is not finite, or with a joint that
     reverses (unknown sign of friction) are left out. Of more than 30,000 poses at rest 30,000 are
-    taken. Not observable if the links have no mass or the torques are constant; a session whose
-    torques are constant is left out.
+    taken. Not observable if the links have no mass or a torque that should change is constant; a
+    session in which one is (``without_dead``) is left out.
     Raises LogError if the log holds something unusable.
     """
     measured = log.get("actual_current_as_torque")
@@ -46,13 +47,17 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if measured is None or needs:
         return NotObservable("torque", needs)
     whole = motion_of(log)
-    still = unchanging(log, measured)
-    measured = np.where(still[:, None], np.nan, measured)
+    measured, dead = without_dead(
+        log,
+        measured,
+        whole,
+        model.arm.n,
+        lambda part: predict_torque(model, with_pieces(model, part)),
+    )
     finite = np.isfinite(measured[whole.rows]).all(axis=1)
     rows = subsampled(log, whole.valid & finite & _steady(whole), whole)
     if not len(rows):
-        changing = " that changes" if still.any() else ""
-        return NotObservable("torque", (f"actual_current_as_torque{changing}",))
+        return NotObservable("torque", living("actual_current_as_torque", dead))
     return _observed(model, log, measured, whole, rows)
 
 

@@ -13,9 +13,10 @@ from gapbridge.core.diagnosis.channels.recording import (
     CONSTANT_SPREAD,
     conditions,
     instrument_noise,
+    living,
     quantities,
     subsampled,
-    unchanging,
+    without_dead,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_loads
@@ -38,9 +39,8 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
 
     Torques are weighted by the ratio of the noise of forces to that of torques. Rows without
     derivatives and rows whose wrench is not finite are left out. Of more than 30,000 poses at rest
-    30,000 are taken. Not observable if the readings are constant while the joints move: a sensor
-    that is not there; a session in which they are is left out. Raises LogError if the log holds
-    something unusable.
+    30,000 are taken. Not observable if the sensor, or an axis of it, is dead (``without_dead``); a
+    session in which one is is left out. Raises LogError if the log holds something unusable.
     """
     measured = log.get("ft_raw_wrench")
     needs = [] if measured is not None else ["ft_raw_wrench"]
@@ -50,12 +50,12 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if measured is None or joints is None:
         return NotObservable("wrench", tuple(needs))
     whole = motion_of(log)
-    still = unchanging(log, measured) & ~unchanging(log, joints)
-    measured = np.where(still[:, None], np.nan, measured)
+    measured, dead = without_dead(
+        log, measured, whole, 3, lambda part: predict_wrench(model, with_pieces(model, part))
+    )
     rows = subsampled(log, whole.valid & np.isfinite(measured[whole.rows]).all(axis=1), whole)
     if not len(rows):
-        changing = " that changes" if still.any() else ""
-        return NotObservable("wrench", (f"ft_raw_wrench{changing}",))
+        return NotObservable("wrench", living("ft_raw_wrench", dead))
     return _observed(model, log, measured, whole, rows)
 
 

@@ -20,6 +20,7 @@ from gapbridge.core.diagnosis.selection.candidate import jacobian, named_candida
 from gapbridge.core.diagnosis.thinning import thinned
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.metrology import Metrology
+from gapbridge.core.sessions import with_sessions
 
 METROLOGY = Metrology()
 N = 6
@@ -231,6 +232,43 @@ def test_columns_that_never_change_are_no_torques(recorded, plant):
     """A recorder writes zeros where a controller gives nothing: no cause is to be found there."""
     dead = observe(plant.model(2.0), silent(recorded), METROLOGY)
     assert dead == NotObservable("torque", ("actual_current_as_torque that changes",))
+
+
+@pytest.mark.parametrize(("joint", "stands"), [(1, 0.0), (1, -37.25), (5, 0.0)])
+def test_a_torque_that_never_changes_under_weights_that_do_is_no_torque(
+    plant, recorded, joint, stands
+):
+    """One dead joint of six was a first moment of 10 kg m, or no payload, with certainty."""
+    torque = recorded[4].copy()
+    log = log_of(recorded, torque)
+    log.columns["actual_current_as_torque"][:, joint] = stands
+    assert observe(plant.model(2.0), log, METROLOGY) == NotObservable(
+        "torque", (f"actual_current_as_torque_{joint} that changes",)
+    )
+
+
+def test_a_constant_torque_that_should_be_constant_is_one(plant):
+    """Joint 1 of an upright arm bears no weight: a simulator without noise gives zeros there."""
+    q = truth.poses(N, 60, 3)
+    torque = plant.dynamics(q, 0 * q, 0 * q, payload=2.0)[0]
+    torque[:, 0] = 0.0
+    log = truth.log_of(
+        N, timestamp=np.arange(60) * 5.0, actual_q=q, actual_current_as_torque=torque
+    )
+    assert isinstance(observe(plant.model(2.0), log, METROLOGY), Observation)
+
+
+def test_sessions_of_one_pose_each_are_no_dead_torques(plant):
+    """Six poses, each held for a while: within a session nothing changes, and nothing should."""
+    q = np.repeat(truth.poses(N, 6, 3), 5, axis=0)
+    torque = np.round(plant.dynamics(q, 0 * q, 0 * q, payload=2.0)[0], 1)
+    log = truth.log_of(
+        N, timestamp=np.arange(30.0) * 5, session=np.repeat(np.arange(6), 5), actual_q=q,
+        actual_current_as_torque=torque,
+    )  # fmt: skip
+    seen = observe(plant.model(2.0), with_sessions(log, plant.model(2.0)), METROLOGY)
+    assert isinstance(seen, Observation)
+    assert len(seen.rows) == 30
 
 
 def faded(plant, recorded):

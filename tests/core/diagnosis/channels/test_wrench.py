@@ -15,7 +15,7 @@ from gapbridge.core.diagnosis.finding import ChannelFinding, Check, NotAccused
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.metrology import Metrology
-from gapbridge.core.sessions import join_sessions
+from gapbridge.core.sessions import join_sessions, with_sessions
 
 METROLOGY = Metrology()
 N, ROWS = 7, 70
@@ -251,3 +251,23 @@ def test_readings_that_never_change_are_no_load(plant, session, stands):
     seen = observe(model, join_sessions([alive, dead], model), METROLOGY)
     assert isinstance(seen, Observation)
     assert seen.rows.max() < ROWS  # of two sessions, that whose sensor measures
+
+
+@pytest.mark.parametrize(("axes", "stands"), [((0,), 0.0), ((2,), -4.2), ((3, 4, 5), 0.0)])
+def test_an_axis_that_never_changes_under_a_load_that_does_is_dead(plant, session, axes, stands):
+    """A dead axis was a bias of -10 N, with certainty; a sensor of forces alone was unexplained."""
+    dead = log_of(session, session[3])
+    dead.columns["ft_raw_wrench"][:, list(axes)] = stands
+    assert observe(plant.model(2.0), dead, METROLOGY) == NotObservable(
+        "wrench", tuple(f"ft_raw_wrench_{axis} that changes" for axis in axes)
+    )
+
+
+def test_a_sensor_of_zeros_at_rest_in_each_session_is_dead(plant, session):
+    rows = np.repeat(np.arange(6), 5)
+    log = truth.log_of(
+        N, timestamp=np.arange(30.0) * 5, session=rows, actual_q=session[0][rows],
+        ft_raw_wrench=np.zeros((30, 6)),
+    )  # fmt: skip
+    seen = observe(plant.model(2.0), with_sessions(log, plant.model(2.0)), METROLOGY)
+    assert seen == NotObservable("wrench", ("ft_raw_wrench that changes",))
