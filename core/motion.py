@@ -34,6 +34,10 @@ LEAD = 0.5  # s before a row that delays look back to
 TURN = 2 * np.pi
 WITHIN_TURN = TURN + 0.01  # rad: angles beyond it, in degrees or not, do not wrap
 SMALLEST_MOTION = 1e-4  # rad/s, what counts as standing still at least
+SPEED_WINDOW = 0.05  # s over which speeds are compared with the way of the angles
+MIN_WINDOWS = 20
+MIN_SPEED = 0.02  # rad/s rms, from which a joint's speeds are compared
+SPEED_SHARE = 0.5, 2.0  # of the angles' change: speeds beyond are none, or have another unit
 
 
 @dataclass(frozen=True)
@@ -200,8 +204,44 @@ def _turns_passed(log: Log, q: Array) -> Array:
     return turns
 
 
+def without_wrong_speeds(log: Log) -> Log:
+    """Return the log without ``actual_qd`` where the angles of a recording contradict it.
+
+    Some recorders write zeros, degrees per second or a motor's speeds. ``wrong_speeds`` of the log
+    names the joints, and how many times the speeds are what they should be.
+    """
+    time, q, speed = (log.get(name) for name in ("timestamp", "actual_q", "actual_qd"))
+    if time is None or q is None or speed is None or len(time) < MIN_WINDOWS:
+        return log
+    if not np.isfinite(np.column_stack([time, q, speed])).all() or (np.diff(time) < 0).any():
+        return log  # refused where it is used
+    rows, t, _ = _clock(log, time)
+    step = float(np.median(np.diff(t)))
+    if not 0 < step <= MAX_SAMPLE_TIME:
+        return log
+    width = max(round(SPEED_WINDOW / step), 1)
+    mean = (speed[rows][1:] + speed[rows][:-1]) / 2
+    travelled = np.vstack([0 * q[:1], np.cumsum(mean * np.diff(t)[:, None], axis=0)])[::width]
+    took = np.diff(t[::width])
+    whole = (took > 0) & (took < 2 * width * step)  # no pause
+    way, travelled = np.diff(q[rows][::width], axis=0)[whole], np.diff(travelled, axis=0)[whole]
+    if len(way) < MIN_WINDOWS:
+        return log
+    square = np.maximum((way**2).sum(axis=0), 1e-300)
+    share = (way * travelled).sum(axis=0) / square
+    # poses at rest that were given times jump to and fro
+    moves = np.sqrt(square / len(way)) > MIN_SPEED * width * step
+    smooth = (np.diff(way, axis=0) ** 2).sum(axis=0) < square
+    wrong = moves & smooth & ((share < SPEED_SHARE[0]) | (share > SPEED_SHARE[1]))
+    if not wrong.any():
+        return log
+    columns = {name: values for name, values in log.columns.items() if name != "actual_qd"}
+    joints = tuple((np.flatnonzero(wrong) + 1).tolist())
+    return replace(log, columns=columns, wrong_speeds=(joints, float(np.median(share[wrong]))))
+
+
 def _motion_of(log: Log) -> Motion:
-    log = without_turns(log)
+    log = without_wrong_speeds(without_turns(log))
     q = log.require("actual_q", "target_q")
     time = log.require("timestamp") if log.has("timestamp") else None
     rows: Any = np.arange(len(q))

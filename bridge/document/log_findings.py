@@ -26,6 +26,8 @@ TEXTS = {
     "in time order",
     LogCheck.WHOLE_TURNS: "joint(s) {0} jump by whole turns, or are commanded on another turn; "
     "their angles were continued",
+    LogCheck.WRONG_SPEEDS: "actual_qd of joint(s) {0} is {1:.3g} times what the angles change by, "
+    "expected rad/s; the column was left out, and speeds were taken from the angles",
     LogCheck.NO_READING: "{0} row(s) have no {1:reading} and were left out",
     LogCheck.POSITIONS_AT_REST: "the measured positions hardly change: is it the right column?",
     LogCheck.FAHRENHEIT: "the joint temperatures look like Fahrenheit, expected °C",

@@ -83,7 +83,7 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Uncertain
-from gapbridge.core.motion import without_turns
+from gapbridge.core.motion import without_turns, without_wrong_speeds
 from gapbridge.core.sessions import session_of, sessions_in, with_sessions
 
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
@@ -158,7 +158,7 @@ def diagnose(
     # matrices of this size gain nothing from threads
     with threadpool_limits(1, "blas"):
         metrology = metrology or Metrology()
-        log = without_turns(with_sessions(log, model))
+        log = without_wrong_speeds(without_turns(with_sessions(log, model)))
         if metrology.remounted:  # each session has a tool point of its own
             withhold = (*withhold, *correcting("tool"))
         return _diagnose(model, log, metrology, tuple(withhold), progress, observers, simulated)

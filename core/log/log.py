@@ -64,6 +64,8 @@ class Log:
     files: tuple[str, ...] = ()  # that several sessions came from; none: ``path`` alone
     numbers: Index | None = None  # (N,) of the rows of several sessions, from 1
     turned: tuple[int, ...] = ()  # joints (from 1) whose angles were moved by whole turns
+    # joints (from 1) whose ``actual_qd`` was left out, and how many times the true speeds it was
+    wrong_speeds: tuple[tuple[int, ...], float] = ((), 1.0)
     one_clock: bool = True  # False: timestamps of later sessions were shifted behind the first's
     # cache of data derived from these rows (``motion_of``); empty for a selection of rows
     derived: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)

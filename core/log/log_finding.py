@@ -19,6 +19,7 @@ class LogCheck(Enum):
     REPEATED_TIME = auto()  # rows
     BACKWARD_TIME = auto()  # rows, line of the first
     WHOLE_TURNS = auto()  # joints
+    WRONG_SPEEDS = auto()  # joints, the speeds over those of the angles
     NO_READING = auto()  # rows, column
     POSITIONS_AT_REST = auto()
     FAHRENHEIT = auto()

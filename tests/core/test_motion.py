@@ -11,7 +11,7 @@ import pytest
 from gapbridge.core.derivatives import differentiate, signal_noise
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
-from gapbridge.core.motion import motion_of, time_finding, without_turns
+from gapbridge.core.motion import motion_of, time_finding, without_turns, without_wrong_speeds
 
 COURSE = truth.course(6, 1)
 ENCODER = 1.2e-5  # rad
@@ -40,6 +40,50 @@ def test_measured_speeds_without_noise_make_accelerations_exact():
     log = truth.log_of(6, timestamp=t, actual_q=COURSE.at(t), actual_qd=COURSE.at(t, 1))
     motion = motion_of(log)
     assert np.abs(motion.qdd - COURSE.at(t, 2))[motion.valid].max() < 1e-4
+
+
+WRONG_SPEEDS = {
+    "degrees": (np.full(6, 180 / np.pi), (1, 2, 3, 4, 5, 6)),
+    "zeros": (np.zeros(6), (1, 2, 3, 4, 5, 6)),
+    "one joint without": (np.array([1, 1, 0, 1, 1, 1]), (3,)),
+    "another sign": (np.array([1, -1, 1, 1, 1, 1]), (2,)),
+    "motors": (np.full(6, 101.0), (1, 2, 3, 4, 5, 6)),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_SPEEDS)
+def test_speeds_that_are_not_those_of_the_angles_are_left_out(wrong):
+    """In degrees a payload and first moments were named; zeros made a recording poses at rest."""
+    factor, joints = WRONG_SPEEDS[wrong]
+    t, log = recording(125.0, 20)
+    log.columns["actual_qd"] = COURSE.at(t, 1) * factor
+    motion = motion_of(log)
+    assert motion.moving
+    assert np.abs(motion.qd - COURSE.at(t, 1))[motion.valid].max() < 0.01
+    left = without_wrong_speeds(log)
+    assert not left.has("actual_qd")
+    assert left.wrong_speeds[0] == joints
+    assert left.wrong_speeds[1] == pytest.approx(factor[joints[0] - 1], abs=0.01 * factor.max())
+
+
+@pytest.mark.parametrize("rate", [500.0, 25.0, 8.0])
+@pytest.mark.parametrize("rounded", [False, True])
+def test_speeds_with_noise_delay_and_rests_are_kept(rate, rounded):
+    t, log = recording(rate, 40)
+    seen = np.minimum(t, 25.0)  # the arm rests at the end
+    noise = np.random.default_rng(0).normal(0, 0.05, (len(t), 6))
+    speed = np.where((t < 25)[:, None], COURSE.at(t - 0.02, 1), 0.0) + noise
+    log.columns.update(actual_q=COURSE.at(seen), actual_qd=speed)
+    if rounded:
+        log.columns["timestamp"] = np.floor(t * 10) / 10
+    assert without_wrong_speeds(log) is log
+
+
+def test_poses_at_rest_that_were_given_times_stay_poses_at_rest():
+    q = truth.poses(6, 200, 3) / 10
+    log = truth.log_of(6, timestamp=np.arange(200) * 0.1, actual_q=q, actual_qd=np.zeros((200, 6)))
+    assert without_wrong_speeds(log) is log
+    assert not motion_of(log).moving
 
 
 def test_the_noise_of_a_smooth_signal_is_found():

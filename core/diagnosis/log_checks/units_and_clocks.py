@@ -168,6 +168,8 @@ def findings(
     With ``model`` also on joint limits, number of poses, frames and signs.
     """
     turned = [LogFinding(LogCheck.WHOLE_TURNS, (log.turned,))] if log.turned else []
+    if log.wrong_speeds[0]:
+        turned.append(LogFinding(LogCheck.WRONG_SPEEDS, log.wrong_speeds))
     listed = [*_names(log), *_times(log), *turned, *_gaps(log)]
     measured = log.get("measured_position")
     at_rest = False

@@ -112,6 +112,11 @@ def test_joints_that_were_moved_by_whole_turns_are_named():
     assert "joint(s) 2, 6 jump by whole turns" in line
 
 
+def test_speeds_that_were_left_out_are_reported():
+    log = replace(with_columns(), wrong_speeds=((1, 2), 57.3))
+    assert "actual_qd of joint(s) 1, 2 is 57.3 times what" in reported(log)
+
+
 def test_fahrenheit_is_reported():
     assert "Fahrenheit" in reported(with_columns(joint_temperatures=SESSION.temperature * 1.8 + 70))
 
