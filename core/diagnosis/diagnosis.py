@@ -18,6 +18,7 @@ from gapbridge.core.diagnosis.all_rows.refit_on_all_rows import (
     accused_on_all_rows,
     fitted_on_all_rows,
     with_undecided_terms,
+    without_causes,
 )
 from gapbridge.core.diagnosis.all_rows.remaining_structure import (
     Depends,
@@ -411,6 +412,11 @@ def _channel_diagnosis(
         sizes = sizes_of(final, gap, remaining)
     else:
         sizes = streamed_sizes(streamed, decided, judgement.accused)
+    if sizes.remaining_rms > sizes.gap_rms and judgement.accused:
+        # terms of any size are compared to first order, at which their gain may be none
+        judgement = without_causes(judgement, searched.depends(()))
+        chosen, remaining = [], gap
+        sizes = replace(sizes, remaining_rms=sizes.gap_rms)
     causes = causes_of(decided, judgement, held_out, model.arm)
     if searched.more and streamed is None:
         judgement = with_excess(judgement, final, remaining, searched.depends)

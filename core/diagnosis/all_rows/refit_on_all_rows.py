@@ -144,6 +144,14 @@ def accused_on_all_rows(
     return selection, replace(judgement, ties=ties_of(selection, judgement.accused))
 
 
+def without_causes(judgement: Judgement, depends_on: tuple[tuple[str, float], ...]) -> Judgement:
+    """Return the judgement of causes with which the gap of all rows is larger than without them."""
+    return replace(
+        judgement, accused=(), structured=True, p_value=0.0, depends_on=depends_on,
+        withdrawn=(*judgement.withdrawn, *((p, NO_GAIN) for p in judgement.accused)),
+    )  # fmt: skip
+
+
 def _without(
     reasons: Mapping[int, Withdrawal], selection: Selection, judgement: Judgement, refits: Refits
 ) -> tuple[Selection, Judgement]:

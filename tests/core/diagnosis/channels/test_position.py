@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import small_arm as small
 
 from gapbridge.bridge.document.diagnosis_json import document
+from gapbridge.core.diagnosis import diagnosis as core
 from gapbridge.core.diagnosis.channels.position import observe
+from gapbridge.core.diagnosis.finding import ChannelFinding, Check, NotAccused
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
 from gapbridge.core.metrology import Metrology
@@ -48,6 +52,27 @@ def test_a_cause_is_named_with_its_joint_and_its_size(effect, registered):
     assert cause.shrink.interval[0] < cause.shrink.shrink < cause.shrink.interval[1]
     assert channel.remaining_rms_held_out < 1.2 * small.FLOOR
     assert channel.remaining_rms <= channel.remaining_rms_held_out < channel.gap_rms
+
+
+def test_what_makes_the_gap_larger_is_no_cause(monkeypatch):
+    """A force sensor with x and y swapped: its turn of 2.6 rad was compared to first order."""
+
+    def larger(*arguments):
+        sizes = sizes_of(*arguments)
+        return replace(sizes, remaining_rms=1.1 * sizes.gap_rms)
+
+    sizes_of = core.sizes_of
+    monkeypatch.setattr(core, "sizes_of", larger)
+    session = small.session_of(0)
+    read = small.readings(small.turned(2, lambda s, q: np.full(len(q), 8e-4)), session)
+    found = core.diagnose(
+        small.model_of(), small.log_of(session, read), Metrology(registered=True, sigma=small.SIGMA)
+    )
+    (channel,) = found.channels
+    assert (channel.verdict, channel.causes, found.model.terms) == ("unexplained", (), ())
+    assert channel.remaining_rms == channel.remaining_rms_held_out == channel.gap_rms
+    facts = [f.fact for f in found.findings if isinstance(f, ChannelFinding)]
+    assert [f.reason.failed for f in facts if isinstance(f, NotAccused)] == [Check.ALL_ROWS_GAIN]
 
 
 def test_a_remounted_tools_columns_are_those_of_the_arm_found():
