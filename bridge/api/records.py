@@ -155,11 +155,18 @@ class Diagnosed:
     def save(self, path: Path | str, *, stand_ins: bool = False) -> None:
         """Write the cell with the causes added, as ``--apply`` (``--stand-ins``) does.
 
-        Without causes where the measured poses are another arm's: nothing fitted to them holds.
+        No cause is written where poses or weights are another arm's: nothing that is fitted holds.
+        None of a channel whose readings are not what they should be is written.
         """
-        from gapbridge.bridge.api.uncertainty import cause_entries, intervals_applied, spread_of
+        from gapbridge.bridge.api.uncertainty import (
+            cause_entries,
+            intervals_applied,
+            spread_of,
+            without_misread,
+        )
 
-        diagnosis, cell = self.diagnosis, self.cell
+        cell = self.cell
+        diagnosis = without_misread(self.diagnosis, cell.model, self.log)
         if any(isinstance(f, LogFinding) and f.forbids_fit for f in diagnosis.findings):
             origin = fitted(
                 self.document["provenance"], cell.fitted_range, cell.spread, cell.intervals,

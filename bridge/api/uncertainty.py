@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,29 @@ from gapbridge.bridge.document.diagnosis_json import parameter_entries
 from gapbridge.bridge.document.provenance import fitted, intervals_of
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.diagnosis.model_terms import model_terms, terms_with_stand_ins, with_causes
 from gapbridge.core.effects import CATALOGUE, flexibility_names
 from gapbridge.core.estimation.identification import Identification
+from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogFinding
+from gapbridge.core.model import Model
+from gapbridge.core.sessions import with_sessions
+
+
+def without_misread(diagnosis: Diagnosis, model: Model, log: Log) -> Diagnosis:
+    """Return a diagnosis without the causes of channels whose readings mean something else."""
+    misread = {f.misread for f in diagnosis.findings if isinstance(f, LogFinding)}
+    if not misread & {channel.channel for channel in diagnosis.channels}:
+        return diagnosis
+    channels = tuple(
+        replace(c, causes=(), stand_ins=()) if c.channel in misread else c
+        for c in diagnosis.channels
+    )
+    log = with_sessions(log, model)
+    return replace(
+        diagnosis, channels=channels, model=with_causes(model, model_terms(channels, log)),
+        with_stand_ins=with_causes(model, terms_with_stand_ins(channels, log)),
+    )  # fmt: skip
 
 
 def spread_of(diagnosis: Diagnosis) -> Spread:

@@ -77,6 +77,10 @@ TEXTS = {
     LogCheck.PULL_SIGN_IN_TOOL: PULL.format("to have the wrong sign and to be in tool axes"),
     LogCheck.WRENCH_SIGN: "ft_raw_wrench seems to have the wrong sign; expected what the load does "
     "to the sensor (a mass at rest reads its weight, pointing down)",
+    LogCheck.TORQUES_FIRST: "ft_raw_wrench seems to hold torques before forces; expected forces in "
+    "_0 to _2, torques in _3 to _5",
+    LogCheck.LEFT_HANDED_WRENCH: "ft_raw_wrench seems to be in left-handed axes: its forces are "
+    "those along {0}, {1} and {2} of the flange; expected x, y and z",
     LogCheck.TORQUE_SIGN: "actual_current_as_torque seems to have the wrong sign; expected what "
     "the motors deliver",
     LogCheck.TORQUE_UNSIGNED: "actual_current_as_torque is never negative, though joints turn both "

@@ -59,6 +59,8 @@ class LogCheck(Enum):
     PULL_IN_TOOL = auto()
     PULL_SIGN_IN_TOOL = auto()
     WRENCH_SIGN = auto()
+    TORQUES_FIRST = auto()
+    LEFT_HANDED_WRENCH = auto()  # axes of the flange that its three forces are along, with signs
     TORQUE_SIGN = auto()
     TORQUE_UNSIGNED = auto()
     CURRENTS = auto()  # share of the weights, joints
@@ -69,9 +71,16 @@ class LogCheck(Enum):
 
 OTHER_ARM_CHECKS = (
     LogCheck.NOT_IN_BASE, LogCheck.POSITIONS_OFF, LogCheck.POSITIONS_OFF_BY, LogCheck.ROTATIONS_OFF,
-    LogCheck.ROLL_PITCH_YAW, LogCheck.TARGET_AXES,
+    LogCheck.ROLL_PITCH_YAW, LogCheck.TARGET_AXES, LogCheck.GRAVITY,
 )  # fmt: skip
-"""The measured poses are not those of the cell's arm: nothing that is fitted to them holds."""
+"""The poses, or the weights, are not those of the cell's arm: nothing that is fitted holds."""
+
+MISREAD = {
+    LogCheck.WRENCH_SIGN: "wrench", LogCheck.TORQUES_FIRST: "wrench",
+    LogCheck.LEFT_HANDED_WRENCH: "wrench", LogCheck.TORQUE_SIGN: "torque",
+    LogCheck.TORQUE_UNSIGNED: "torque", LogCheck.CURRENTS: "torque",
+}  # fmt: skip
+"""Channels whose readings are not what their column should hold."""
 
 TOOL_CHECKS = (
     LogCheck.FLANGE_NOT_TCP, LogCheck.TCP_SIGN, LogCheck.NO_TCP, LogCheck.OTHER_TCP,
@@ -92,7 +101,12 @@ class LogFinding:
 
     @property
     def forbids_fit(self) -> bool:
-        """Return whether nothing fitted to the measured poses holds: they are another arm's."""
+        """Return whether nothing that is fitted holds: poses or weights are another arm's."""
         causes = [value for value in self.values if isinstance(value, LogFinding)]
         checks = [cause.check for cause in causes] or [self.check]
         return self.check in OTHER_ARM_CHECKS and not any(c in TOOL_CHECKS for c in checks)
+
+    @property
+    def misread(self) -> str:
+        """Return the channel of which no cause holds, as its readings mean another; "": none."""
+        return MISREAD.get(self.check, "")

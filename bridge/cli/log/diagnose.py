@@ -103,8 +103,9 @@ def diagnose(
         )  # fmt: skip
     for finding in wrong_arm_findings(found.diagnosis):
         text = log_finding_text(finding)
-        if output.new_cell is not None and finding.forbids_fit:
-            text += "; no cause is written into the cell"
+        if output.new_cell is not None and (finding.forbids_fit or finding.misread):
+            of = f" of {finding.misread}" if finding.misread else ""
+            text += f"; no cause{of} is written into the cell"
         click.echo(f"warning: {rows.path}: {text}", err=True)
     written = output.write(found)  # before the text: its reader may leave early
     click.echo(diagnosis_text(found.diagnosis))

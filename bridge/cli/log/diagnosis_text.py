@@ -53,9 +53,9 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
 
 
 def wrong_arm_findings(diagnosis: Diagnosis) -> list[LogFinding]:
-    """Return the findings that the measured poses are those of another arm: warnings."""
+    """Return the findings that poses or readings are not what they should be: warnings."""
     findings = [f for f in diagnosis.findings if isinstance(f, LogFinding)]
-    return [f for f in findings if f.check in OTHER_ARM_CHECKS]
+    return [f for f in findings if f.check in OTHER_ARM_CHECKS or f.misread]
 
 
 def gap_text(value: float | None, unit: str) -> str:

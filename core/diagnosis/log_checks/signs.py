@@ -6,6 +6,7 @@ with the force reversed, or in tool axes, the column has another convention.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -46,6 +47,7 @@ def sign_findings(model: Model, log: Log) -> list[LogFinding]:
         checked = name == "ft_raw_wrench" or model.arm.mass.any()
         if checked and _is_reversed(model, log, q, name):
             findings.append(LogFinding(check))
+    findings = findings or _sensor_axes(model, log, q)
     pull = log.get("actual_TCP_force")
     if pull is None or findings:
         return findings
@@ -179,6 +181,34 @@ def _is_unsigned(log: Log, q: Array) -> bool:
     turns = np.minimum((step > 0).mean(axis=0), (step < 0).mean(axis=0)) > MIN_SHARE_EACH_WAY
     pushed = np.fmax.reduce(torque, axis=0) > 0
     return int((turns & pushed).sum()) >= MIN_JOINTS_UNSIGNED
+
+
+def _sensor_axes(model: Model, log: Log, q: Array) -> list[LogFinding]:
+    """Return the finding on a force sensor of left-handed axes, or with torques before forces.
+
+    Right-handed axes are a misalignment, which the diagnosis measures.
+    """
+    wrench, pull = log.get("ft_raw_wrench"), log.get("actual_TCP_force")
+    rows = _rows(q, wrench, pull)
+    if wrench is None or len(rows) < MIN_ROWS:
+        return []
+    read = wrench[rows]
+    load = None if pull is None else pull[rows]
+    force = _predicted(model, log, q, "ft_raw_wrench", load, rows)[:, :3]
+    if spread_of(force) < MIN_FORCE:
+        return []
+    likely = MAX_SHARE_WITH_OTHER_SIGN * spread_of(read[:, :3] - force)
+    if spread_of(read[:, 3:] - force) < likely:
+        return [LogFinding(LogCheck.TORQUES_FIRST)]
+    axes = [np.eye(3)[list(order)] * sign[:, None] for order in itertools.permutations(range(3))
+            for sign in np.array(list(itertools.product((1.0, -1.0), repeat=3)))]  # fmt: skip
+    left = {k: spread_of(read[:, :3] - force @ turn.T) for k, turn in enumerate(axes)}
+    best = axes[min(left, key=lambda k: left[k])]
+    if min(left.values()) > likely or np.linalg.det(best) > 0 or (best == -np.eye(3)).all():
+        return []
+    names = tuple("xyz"[int(np.argmax(np.abs(row)))] for row in best)
+    signed = tuple(("-" if row.sum() < 0 else "") + n for row, n in zip(best, names, strict=True))
+    return [LogFinding(LogCheck.LEFT_HANDED_WRENCH, signed)]
 
 
 def _is_reversed(model: Model, log: Log, q: Array, name: str) -> bool:

@@ -15,9 +15,12 @@ from scipy.spatial.transform import Rotation
 from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import ColumnsAndOrder, check_units
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import findings as log_findings
+from gapbridge.core.dynamics import predict_wrench
 from gapbridge.core.errors import LogError
+from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
+from gapbridge.core.motion import Motion
 
 MODEL = small.model_of()
 SESSION = small.session_of()
@@ -279,6 +282,31 @@ def test_a_sensor_or_a_pull_of_the_wrong_sign_is_suspected(moving, turned):
         kept[turned] = -kept[turned]
         (line,) = findings(truth.log_of(7, **kept), model, FREE)
         assert line.startswith(f"{turned} seems to have the wrong sign;")
+
+
+AXES = {
+    "those along y, x and z": ([1, 0, 2], [1, 1, 1]),
+    "those along -x, y and z": ([0, 1, 2], [-1, 1, 1]),
+    "torques before forces": ([3, 4, 5], [1, 1, 1]),
+    "": ([1, 0, 2], [1, -1, 1]),  # right-handed: a misalignment
+}
+
+
+@pytest.mark.parametrize("mistake", AXES)
+@pytest.mark.parametrize("pulled", [True, False])
+def test_left_handed_axes_of_a_force_sensor_are_reported(moving, mistake, pulled):
+    """Swapped axes were a misalignment of 2.6 rad, with which the gap was twice as large."""
+    model, columns = moving
+    order, sign = AXES[mistake]
+    axes = [*order, *((np.array(order) + 3) % 6)]
+    kept = {k: v for k, v in columns.items() if "torque" not in k}
+    kept["ft_raw_wrench"] = kept["ft_raw_wrench"][:, axes] * [*sign, *sign]
+    if not pulled:
+        alone = Motion.at_rest(kept["actual_q"], Loads(payload_mass=kept["payload"]))
+        kept["ft_raw_wrench"] = predict_wrench(model, alone)[:, axes] * [*sign, *sign]
+        del kept["actual_TCP_force"], kept["payload_cog"]
+    lines = findings(truth.log_of(7, **kept), model, FREE)
+    assert [mistake in line for line in lines] == [True] * bool(mistake)
 
 
 @pytest.mark.parametrize("unit", ["s", "milliseconds", "microseconds", "nanoseconds"])
