@@ -94,7 +94,10 @@ def join_sessions(logs: Sequence[Log], model: Model) -> Log:
                 "expected one log a session, or one log with all of them"
             )
     paths = [log.path for log in logs]
-    return replace(_join(logs, names, model, ", ".join(paths)), files=tuple(paths))
+    joined = _join(logs, names, model, ", ".join(paths))
+    # rows without times are numbered from 1 in each file: clocks that overlap
+    one_clock = joined.one_clock and joined.has("timestamp")
+    return replace(joined, files=tuple(paths), one_clock=one_clock)
 
 
 def _names(paths: Sequence[str]) -> tuple[str, ...]:

@@ -171,7 +171,8 @@ def considered_of(
         if channel not in effect.channels or identifier in accused or identifier in withhold:
             continue
         variants = [c for c, k in enumerate(space.candidates) if k.family == identifier]
-        excited = any(_excited(selection, c) for c in variants)
+        # of usual size it may not show in a short log, but what was found did
+        excited = identifier in reasons or any(_excited(selection, c) for c in variants)
         variants = _first_variants(selection, variants)
         if not variants or not excited:
             needs = effect.motion or ", ".join(effect.needs)

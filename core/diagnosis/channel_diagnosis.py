@@ -121,23 +121,26 @@ def first_session(moment: float, log: Log) -> str:
 def on_own_clocks(channel: ChannelDiagnosis, log: Log) -> ChannelDiagnosis:
     """Return a channel's diagnosis whose moments are of the sessions' own clocks.
 
-    Where these overlap, a moment has no value (nan), but the first session after it.
+    Where these overlap, a moment has no value (nan), but the first session after it. Where the log
+    has no times, it is a row's number, which has no unit.
     """
-    if log.one_clock:
+    if log.one_clock and log.has("timestamp"):
         return channel
 
-    def with_session(parameters: Iterable[Reported]) -> tuple[Reported, ...]:
-        return tuple(
-            replace(p, value=float("nan"), std=None, session=first_session(p.value, log))
-            if p.is_time else p
-            for p in parameters
-        )  # fmt: skip
+    def own(moment: Reported) -> Reported:
+        if log.one_clock:
+            return replace(moment, unit="")
+        session = first_session(moment.value, log)
+        return replace(moment, value=float("nan"), std=None, session=session)
+
+    def moments(parameters: Iterable[Reported]) -> tuple[Reported, ...]:
+        return tuple(own(p) if p.is_time else p for p in parameters)
 
     def causes(some: Iterable[Cause]) -> tuple[Cause, ...]:
-        return tuple(replace(cause, parameters=with_session(cause.parameters)) for cause in some)
+        return tuple(replace(cause, parameters=moments(cause.parameters)) for cause in some)
 
     def transfer(one: SessionTransfer) -> SessionTransfer:
-        return replace(one, values=tuple((s, with_session(p)) for s, p in one.values))
+        return replace(one, values=tuple((s, moments(p)) for s, p in one.values))
 
     return replace(
         channel, causes=causes(channel.causes), stand_ins=causes(channel.stand_ins),

@@ -300,7 +300,7 @@ def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFindi
     angles = [turned.get(name, 0.0) for name in log.session_names]
     if np.ptp(angles) > MAX_ARM_ERROR and not metrology.remounted:
         log_findings.append(LogFinding(LogCheck.TARGET_REMOUNTED))
-    if not log.one_clock:
+    if log.has("timestamp") and not log.one_clock:
         log_findings.append(LogFinding(LogCheck.CLOCKS_OVERLAP))
     return log_findings + outside_findings(log)
 

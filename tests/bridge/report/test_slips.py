@@ -13,6 +13,7 @@ import pytest
 
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text
 from gapbridge.bridge.document import blocks
+from gapbridge.bridge.document.diagnosis_json import document as diagnosis_json
 from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.numbers import with_unit
 from gapbridge.bridge.document.pdf import pdf
@@ -214,6 +215,10 @@ def test_a_row_is_no_number_of_seconds() -> None:
     page = html(document(material))
     assert "after row 30" in page
     assert "30.5 s" not in page
+    (cause,) = diagnosis_json(material.diagnosis)["channels"][0]["causes"]
+    assert [(p["name"], p["unit"]) for p in cause["parameters"]] == [
+        ("joint_slip_2", "rad"), ("joint_slip_2_time", ""),
+    ]  # fmt: skip
 
 
 def test_the_report_with_slips_can_be_printed() -> None:

@@ -259,6 +259,24 @@ def test_where_clocks_overlap_a_step_is_told_by_the_first_session_that_has_it(sl
     assert term.values[-1] < session(small.NOMINAL, 34).times()[0]  # all rows have it
 
 
+def test_rows_without_times_are_numbered_in_each_file() -> None:
+    """A number of the joined rows would be that of another row where one file stands alone."""
+    off = small.turned(2, lambda s, q: np.full(len(q), 3e-3))
+    logs = [session(real, seed) for seed, real in ((34, small.NOMINAL), (35, off))]
+    untimed = [
+        replace(log, columns={k: v for k, v in log.columns.items() if k != "timestamp"})
+        for log in logs
+    ]
+    joined = join_sessions(untimed, MODEL)
+    found = diagnose(MODEL, joined, Metrology(sigma=small.SIGMA))
+    (cause,) = document(found)["channels"][0]["causes"]
+    told = [(p["name"], p["value"]) for p in cause["parameters"][1:]]
+    assert told == [("joint_slip_2_time", None), ("joint_slip_2_session", "35.csv")]
+    assert "rows" not in diagnosis_text(found) and "timestamps overlap" not in diagnosis_text(found)
+    (term,) = found.model.terms
+    assert term.values[-1] < untimed[1].times()[0]  # all rows of the second file have it
+
+
 def test_the_model_with_stand_ins_has_the_final_causes_and_applies_steps_everywhere(slipped):
     """The common fit is made before all rows withdraw some of its terms."""
     (channel,) = slipped.channels

@@ -12,6 +12,7 @@ import small_arm as small
 
 from benchmarks.blind.session import Plan
 from gapbridge.core.diagnosis import value_stability
+from gapbridge.core.diagnosis.causes import considered_of
 from gapbridge.core.diagnosis.channels.position import observe as observe_position
 from gapbridge.core.diagnosis.channels.wrench import observe
 from gapbridge.core.diagnosis.criteria import NEGLIGIBLE_SIZE
@@ -48,7 +49,7 @@ def plant(tmp_path_factory):
     return truth.plant(tmp_path_factory.mktemp("arm"), N, 1)
 
 
-def wrench_log(plant, error, mass=2.0, declared=True):
+def wrench_log(plant, error, mass=2.0, declared=True, interval=20.0):
     """Return a log of poses whose sensor reads an ``error(q)`` (N, 6) too much."""
     q = truth.poses(N, ROWS, 5)
     load, still = np.full(ROWS, mass), np.zeros((ROWS, 6))
@@ -56,7 +57,7 @@ def wrench_log(plant, error, mass=2.0, declared=True):
     wrench += np.random.default_rng(3).normal(0, 1, wrench.shape) * NOISE
     more = {"payload": load, "payload_cog": np.tile(truth.COG, (ROWS, 1))} if declared else {}
     return truth.log_of(
-        N, timestamp=np.arange(ROWS) * 20.0, actual_q=q, ft_raw_wrench=wrench, **more
+        N, timestamp=np.arange(ROWS) * interval, actual_q=q, ft_raw_wrench=wrench, **more
     )
 
 
@@ -110,6 +111,21 @@ def test_no_gain_and_no_turn_is_accused_of_a_load_that_is_not(plant):
         c for c in diagnose(bare, log, withhold=("payload",)).channels if c.channel == "wrench"
     )
     assert not {"ft_gain", "ft_misalignment", "payload_cog"} & {c.effect for c in channel.causes}
+
+
+def test_what_the_search_found_is_not_told_as_not_excited(plant):
+    """A drift of usual size would not show in seconds; one that showed and is withdrawn did."""
+    seconds = np.arange(ROWS) * 0.05
+    log = wrench_log(plant, lambda q: seconds[:, None] * WAY, interval=0.05)
+    found = diagnose(plant.model(2.0), log)
+    channel = next(c for c in found.channels if c.channel == "wrench")
+    (position,) = (p for p, t in enumerate(channel.selection.terms) if t.effect == "ft_drift")
+    judgement = replace(
+        channel.judgement, accused=(), withdrawn=((position, Withdrawal(Check.STABLE_VALUE)),)
+    )
+    held_out = HeldOut(channel.selection)
+    told = {c.effect: c for c in considered_of(channel.selection, judgement, held_out)}
+    assert told["ft_drift"].excited and told["ft_drift"].withdrawal is not None
 
 
 def linear(seed, shift):
