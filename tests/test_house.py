@@ -99,7 +99,7 @@ LIBRARIES_ATTRIBUTES = {
     },
     "bridge/patch/mjcf_scene.py": {
         "body.explicitinertial", "body.fullinertia", "body.ialt.type", "body.inertia", "body.ipos",
-        "body.iquat", "body.mass", "joint.parent.name", "self.spec.comment",
+        "body.iquat", "body.mass", "body.name", "self.spec.comment",
         "self.spec.compiler.inertiafromgeom", "self.spec.compiler.settotalmass",
     },
     "bridge/patch/usd_stage.py": {"self.layer.comment", "self.layer.defaultPrim"},

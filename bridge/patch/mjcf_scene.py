@@ -102,7 +102,6 @@ class Scene:
             self.data.qpos[self.compiled.jnt_qposadr[j]] = 0
         mujoco.mj_kinematics(self.compiled, self.data)
         mujoco.mj_comPos(self.compiled, self.data)
-        self._qpos = [np.array(key.qpos) for key in self.spec.keys]
         self._placed: dict[tuple[str, str], Array] = {}  # tag and name -> frame in its parent's
         self._after: dict[str, list[Hinge]] = {}  # by joint
         self._before: dict[str, tuple[str, list[Hinge]]] = {}  # by body: the body inserted before
@@ -123,14 +122,18 @@ class Scene:
 
     def _name_bodies(self) -> None:
         """Name the bodies of named joints, to be found in the XML; others can stay unnamed."""
-        taken = {body.name for body in self.spec.bodies}
         for joint in self.spec.joints:
-            if joint.name and not joint.parent.name:
-                name = f"{joint.name}_body"
-                while name in taken:
-                    name += "_"
-                taken.add(name)
-                joint.parent.name = name
+            if joint.name:
+                self._name(joint.parent, f"{joint.name}_body")
+
+    def _name(self, body: Any, name: str) -> str:
+        """Return a body's name; one that has none gets ``name``, or that with more at its end."""
+        taken = {other.name for other in self.spec.bodies}
+        while not body.name:
+            if name not in taken:
+                body.name = name
+            name += "_"
+        return str(body.name)
 
     def hinges(self) -> list[str]:
         """Return the names of all hinges that have one."""
@@ -268,35 +271,77 @@ class Scene:
         in_written = np.linalg.inv(self._written_in_frame(body))  # which the inserted body gets
         turn, shift = in_written[:3, :3], in_written[:3, 3]
         placed = [replace(h, point=turn @ h.point + shift, axis=turn @ h.axis) for h in hinges]
+        if body.name not in self._before:
+            self._keep_apart(body)
         self._before[body.name] = (name, [*self._before.get(body.name, (name, []))[1], *placed])
+
+    def _keep_apart(self, body: Any) -> None:
+        """Exclude the contacts that MuJoCo itself leaves out while a body is its parent's child."""
+        weld = self.compiled.body_weldid
+        parent = weld[self.compiled.body_parentid[body.id]]
+        unfiltered = self.mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+        if parent == 0 or self.compiled.opt.disableflags & unfiltered:
+            return  # there are contacts already, as with all that stands still
+        for one in self._solid(parent):
+            for other in self._solid(body.id):
+                self.spec.add_exclude(bodyname1=one, bodyname2=other)
+
+    def _solid(self, weld: int) -> list[str]:
+        """Return the names of a body and those fixed to it that have geoms."""
+        fixed = (self.compiled.body_weldid == weld) & (self.compiled.body_geomnum > 0)
+        return [self._name(self.spec.bodies[k], f"body_{k}") for k in np.flatnonzero(fixed)]
 
     @property
     def added_joints(self) -> int:
         """Return the number of added joints."""
         return sum(map(len, self._after.values())) + sum(len(h) for _, h in self._before.values())
 
-    def _keyframes(self, root: ElementTree.Element) -> None:
-        """Rewrite the qpos of keyframes, added joints at zero."""
-        size = {0: 7, 1: 4, 2: 1, 3: 1}  # of qpos: free, ball, slide, hinge
+    def _keyframes(self, root: ElementTree.Element, patched: Any) -> None:
+        """Rewrite keyframes: added joints at zero, added filters of actuators at their control."""
         for key, element in zip(self.spec.keys, root.iterfind("./keyframe/key"), strict=True):
-            qpos = self._qpos[key.id]
-            if not len(qpos):
-                continue
-            parts: list[Array] = []
-            for j in range(self.compiled.njnt):
-                joint = self.compiled.joint(j)
-                body = self.compiled.body(joint.bodyid[0])
-                if j == body.jntadr[0]:
-                    parts.append(np.zeros(len(self._before.get(body.name, ("", []))[1])))
-                begin = joint.qposadr[0]
-                parts.append(qpos[begin : begin + size[int(joint.type[0])]])
-                parts.append(np.zeros(len(self._after.get(joint.name, []))))
-            element.set("qpos", numbers(np.concatenate(parts)))
+            for name, size in (
+                ("qpos", {0: 7, 1: 4, 2: 1, 3: 1}),
+                ("qvel", {0: 6, 1: 3, 2: 1, 3: 1}),
+            ):
+                values = np.array(getattr(key, name))
+                if len(values) and self.added_joints:
+                    element.set(name, numbers(self._with_added_joints(values, size)))
+            if patched.na > self.compiled.na:
+                element.set("act", numbers(self._activations(key, patched)))
+
+    def _with_added_joints(self, values: Array, size: dict[int, int]) -> Array:
+        """Return a keyframe's numbers with zeros for added joints; ``size``: of a type of joint."""
+        parts: list[Array] = []
+        begin = 0
+        for j in range(self.compiled.njnt):
+            joint = self.compiled.joint(j)
+            body = self.compiled.body(joint.bodyid[0])
+            if j == body.jntadr[0]:
+                parts.append(np.zeros(len(self._before.get(body.name, ("", []))[1])))
+            end = begin + size[int(joint.type[0])]
+            parts.append(values[begin:end])
+            parts.append(np.zeros(len(self._after.get(joint.name, []))))
+            begin = end
+        return np.concatenate(parts)
+
+    def _activations(self, key: Any, patched: Any) -> Array:
+        """Return the activations of a keyframe in the patched model."""
+        act, control = np.array(key.act), np.array(key.ctrl)
+        given = act if len(act) else np.zeros(self.compiled.na)
+        values = np.zeros(patched.na)
+        for i in range(patched.nu):
+            new, count = patched.actuator_actadr[i], patched.actuator_actnum[i]
+            old = self.compiled.actuator_actadr[i]
+            if old >= 0:
+                values[new : new + count] = given[old : old + count]
+            elif count and len(control):
+                values[new] = control[i]
+        return values
 
     def text(self, comment: Sequence[str], folder: Path | None) -> str:
         """Return the changed model as XML, its paths relative to ``folder``."""
         self.spec.comment = ""
-        self.spec.compile()
+        patched = self.spec.compile()
         root = ElementTree.fromstring(self.spec.to_xml())
         timestep = float(self.spec.option.timestep)
         text = "\n".join(comment).replace("--", "- -")
@@ -313,8 +358,7 @@ class Scene:
             _write_frame(root, tag, carrier, frame)
         for tendon in self._tendons:
             _write_tendon(root, *tendon)
-        if self.added_joints:
-            self._keyframes(root)
+        self._keyframes(root, patched)
         if folder is not None and folder.resolve() != self.path.parent.resolve():
             _rebase(root, self.path.parent.resolve(), folder.resolve())
         ElementTree.indent(root)

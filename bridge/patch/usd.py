@@ -175,6 +175,8 @@ class _Layer:
         flexibility = self.changes.springs.joint[joint - 1]
         softening = self.changes.springs.softening[joint - 1]
         play = self.changes.of_joint(Kind.PLAY, joint)
+        if play or flexibility.any():
+            self._keep_apart(self.stage.joints[name])
         if play:
             self._add_spring(name, "backlash", frame, 2, half=play / 2)
         for k, label in ((2, "axial_compliance"), (0, "radial_x"), (1, "radial_y")):
@@ -183,6 +185,14 @@ class _Layer:
         if softening > 0:
             self.missing.append(f"stiffening of {name}: its spring is the linear one; a drive's "
                                 "stiffness by angle needs code")  # fmt: skip
+
+    def _keep_apart(self, joint: Any) -> None:
+        """Filter the contacts of a joint's bodies, which simulators do while it joins them."""
+        stage = self.stage
+        parent, child = stage.body(joint, 0), stage.body(joint, 1)
+        if parent and not joint.GetCollisionEnabledAttr().Get():
+            pairs = stage.UsdPhysics.FilteredPairsAPI.Apply(stage.stage.GetPrimAtPath(child))
+            pairs.CreateFilteredPairsRel().AddTarget(parent)
 
     def _add_spring(
         self, name: str, label: str, cell_frame: Array, k: int, stiffness: float = 0.0,

@@ -301,3 +301,53 @@ def test_a_model_in_another_folder_finds_its_files(
     found = patched(tmp_path / "model" / "a.xml", given, OFFSET, options)
     (tmp_path / "out" / "b.xml").write_text(found.text)
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "b.xml")).ntex == 1
+
+
+def contacts(text: str, q: np.ndarray) -> set[tuple[str, ...]]:
+    """Return the names of the links that touch each other at ``q`` (6,)."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    for name, angle in zip(UR_JOINTS, q, strict=True):
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    mujoco.mj_forward(model, data)
+    link = [model.body(model.body_weldid[body]).name for body in model.geom_bodyid]
+    return {tuple(sorted((link[c.geom1], link[c.geom2]))) for c in data.contact[: data.ncon]}
+
+
+@pytest.mark.parametrize("unfiltered", [False, True])
+def test_links_that_touch_across_a_flexible_link_still_do_not_collide(
+    tmp_path: Path, unfiltered: bool
+) -> None:
+    geom = '<geom size="0.35" mass="0"/>'
+    given = re.sub(r"(<joint[^>]*/>)", rf"\1{geom}<body>{geom}</body>", mjcf(ARM, UR_JOINTS))
+    if unfiltered:
+        flag = '<option><flag filterparent="disable"/></option>'
+        given = given.replace("<worldbody>", f"{flag}<worldbody>")
+    model = NOMINAL.with_terms([
+        Term("link_flexibility", Site(2), (2e-5,)), Term("base_compliance", Site(), (1e-5, 1e-5)),
+    ])  # fmt: skip
+    found = patched(tmp_path / "a.xml", given, model, PatchOptions())
+    assert contacts(found.text, Q) == contacts(given, Q)
+    assert (("link_2", "link_3") in contacts(given, Q)) is unfiltered
+
+
+def test_keyframes_hold_velocities_and_activations_of_what_they_belong_to(tmp_path: Path) -> None:
+    given = mjcf(ARM, UR_JOINTS, kp=2000.0).replace("</actuator>", (
+        '<general name="own" joint="wrist_3_joint" dyntype="filter" dynprm="0.1"/></actuator>'
+    ))  # fmt: skip
+    key = '<key name="home" qpos="0 1 2 3 4 5" qvel="0 1 2 3 4 5" ctrl="0 1 2 3 4 5 6" act="0.5"/>'
+    given = re.sub("<keyframe>.*</keyframe>", f"<keyframe>{key}</keyframe>", given)
+    model = NOMINAL.with_terms([
+        Term("tracking_lag", Site(3), (0.04,)), Term("axial_compliance", Site(2), (1e-5,)),
+    ])  # fmt: skip
+    found = mujoco.MjModel.from_xml_string(
+        patched(tmp_path / "a.xml", given, model, PatchOptions()).text
+    )
+    data = mujoco.MjData(found)
+    mujoco.mj_resetDataKeyframe(found, data, 0)
+    for i, name in enumerate(UR_JOINTS):
+        joint = found.joint(name)
+        assert (data.qpos[joint.qposadr[0]], data.qvel[joint.dofadr[0]]) == (i, i), name
+    # the servo starts at its control, not at zero, from where the arm would jump
+    assert data.act[found.actuator_actadr[found.actuator("drive_elbow_joint").id]] == 2.0
+    assert data.act[found.actuator_actadr[found.actuator("own").id]] == 0.5

@@ -323,3 +323,23 @@ def test_a_path_names_a_joint_whose_name_is_its_own(tmp_path: Path) -> None:
         for options in (PatchOptions(), paths)
     }
     assert len(texts) == 1
+
+
+@pytest.mark.parametrize("touching", [False, True])
+def test_links_that_touch_at_a_flexible_joint_still_do_not_collide(
+    tmp_path: Path, touching: bool
+) -> None:
+    write_stage(tmp_path / "a.usda", ARM, 1.0, nested=False)
+    given = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    joint = UsdPhysics.Joint(given.GetPrimAtPath(f"/arm/{UR_JOINTS[2]}"))
+    joint.CreateCollisionEnabledAttr().Set(touching)
+    given.Save()
+    model = NOMINAL.with_terms([Term("axial_compliance", Site(3), (1e-5,))])
+    found = format_of(tmp_path / "a.usda").patch(
+        tmp_path / "a.usda", changes_of(model), PatchOptions(folder=tmp_path), []
+    )
+    (tmp_path / "b.usda").write_text(found.text)
+    stage = Usd.Stage.Open(str(tmp_path / "b.usda"))
+    pairs = UsdPhysics.FilteredPairsAPI(stage.GetPrimAtPath("/arm/link_3"))
+    filtered = [str(path) for path in pairs.GetFilteredPairsRel().GetTargets()]
+    assert filtered == ([] if touching else ["/arm/link_2"])
