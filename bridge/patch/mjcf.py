@@ -120,21 +120,21 @@ class _Patch:
             self.changed.append(f"joint {name}: its body's frame")
 
     def friction(self, name: str, joint: int) -> None:
-        """Add friction, damping and armature."""
-        spec_joint = self.scene.spec.joint(name)
+        """Set friction, damping and armature."""
+        spec_joint, total = self.scene.spec.joint(name), self.options.total
         friction = self.changes.of_joint(Kind.FRICTION, joint)
         damping = self.changes.of_joint(Kind.DAMPING, joint)
         armature = self.changes.of_joint(Kind.ARMATURE, joint)
         if friction:
-            spec_joint.frictionloss += friction
+            spec_joint.frictionloss = total(friction, spec_joint.frictionloss)
             self.changed.append(f"joint {name}: frictionloss {spec_joint.frictionloss:.6g}")
         if damping:
             linear = np.array(spec_joint.damping)
-            linear[0] += damping
+            linear[0] = total(damping, linear[0])
             spec_joint.damping = linear
             self.changed.append(f"joint {name}: damping {linear[0]:.6g}")
         if armature:
-            spec_joint.armature += armature
+            spec_joint.armature = total(armature, spec_joint.armature)
             self.changed.append(f"joint {name}: armature {spec_joint.armature:.6g}")
 
     def actuator(self, name: str, joint: int) -> None:
@@ -152,10 +152,13 @@ class _Patch:
                                 "them into the controller")  # fmt: skip
             return
         if delay:
-            actuator.delay = delay + (actuator.delay if self.options.on_top else 0.0)
+            actuator.delay = self.options.total(delay, actuator.delay)
             actuator.interp = LINEAR  # zero-order hold would delay by whole steps only
             actuator.nsample = int(np.ceil(actuator.delay / self.scene.spec.option.timestep)) + 1
-            self.changed.append(f"actuator of {name}: delay {actuator.delay:.6g} s")
+            self.changed.append(
+                f"actuator of {name}: delay {actuator.delay:.6g} s; after a reset fill its history "
+                "with mj_initCtrlHistory, or it drives to 0 for that time"
+            )
         if lag:
             filter_type = self.scene.mujoco.mjtDyn.mjDYN_FILTEREXACT
             parameters = np.array(actuator.dynprm)

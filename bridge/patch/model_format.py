@@ -21,8 +21,15 @@ class PatchOptions:
     joints: tuple[str, ...] = ()  # its joints, in the order of the arm's
     tcp: str = ""  # its TCP: a site, link or prim
     load: str = ""  # its body that models the declared payload
-    on_top: bool = False  # diagnosed against this simulator: add to the delays and droop it has
+    on_top: bool = False  # diagnosed against this simulator: add to what its joints and servos have
     folder: Path | None = None  # of the patched model, if not the model's own
+
+    def total(self, found: float, own: float) -> float:
+        """Return a joint's or servo's value, of which the model has ``own``.
+
+        Without ``on_top`` the cell's model had none of it: the cell has found all of it.
+        """
+        return found + own if self.on_top else found
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class Urdf(ModelFormat):
             if not np.allclose(changes.shift[i], np.eye(4), rtol=0, atol=TOLERANCE):
                 document.move(name, changes.motion(i, world), frames)
                 changed.append(f"joint {name}: origin")
-            changed += _dynamics(document, name, i + 1, changes)
+            changed += _dynamics(document, name, changes, i + 1, options)
         inertials, without_mass = _inertials(document, names, changes, world, frames)
         changed += inertials
         missing = [*without_mass, *_tool(document, path, changes, options, world, frames, changed),
@@ -188,13 +188,16 @@ def _without_comments(text: str) -> str:
     return re.sub(r"<!--.*?-->", lambda comment: " " * len(comment[0]), text, flags=re.DOTALL)
 
 
-def _dynamics(document: _Document, name: str, joint: int, changes: ModelChanges) -> list[str]:
+def _dynamics(
+    document: _Document, name: str, changes: ModelChanges, joint: int, options: PatchOptions
+) -> list[str]:
     element = document.joints[name].find("dynamics")
     values: dict[str, Array | float] = {}
     for kind, key in ((Kind.FRICTION, "friction"), (Kind.DAMPING, "damping")):
         added = changes.of_joint(kind, joint)
         if added:
-            values[key] = float(numbers_of(element, key, "0", document.label(name))[0]) + added
+            own = float(numbers_of(element, key, "0", document.label(name))[0])
+            values[key] = options.total(added, own)
     if values:
         document.write("joint", name, "dynamics", values)
     return [f"joint {name}: {key} {value:.6g}" for key, value in values.items()]

@@ -88,7 +88,7 @@ class _Layer:
             self.changed.append(f"joint {name}: physics:localPos0, localRot0")
 
     def friction(self, name: str, joint: int) -> None:
-        """Add friction, damping and armature, as PhysX and as Newton name them."""
+        """Set friction, damping and armature, as PhysX and as Newton name them."""
         prim = self.stage.joints[name].GetPrim()
         for kind, names in (
             (Kind.FRICTION, (("newton:friction", 1.0),
@@ -103,7 +103,8 @@ class _Layer:
             if not added:
                 continue
             for attribute, factor in names:
-                value = self._current(prim, attribute) + added * factor / self._torque_unit()
+                found = added * factor / self._torque_unit()
+                value = self.options.total(found, self._current(prim, attribute))
                 self.stage.set(prim, attribute, "Float", value)
                 self.changed.append(f"joint {name}: {attribute} {value:.6g}")
 

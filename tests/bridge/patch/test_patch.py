@@ -164,7 +164,7 @@ def test_moving_effects_become_the_joints_and_actuators_own(tmp_path: Path) -> N
     dof = [compiled.joint(name).dofadr[0] for name in UR_JOINTS]
     assert compiled.dof_frictionloss[dof[0]] == pytest.approx(3.0)
     assert np.ravel(compiled.dof_damping[dof[1]])[0] == pytest.approx(5.0)
-    assert compiled.dof_armature[dof[2]] == pytest.approx(before.dof_armature[dof[2]] + 0.4)
+    assert compiled.dof_armature[dof[2]] == pytest.approx(0.4)
     half = 0.5 * compiled.opt.timestep  # by which a sampled filter answers earlier
     assert compiled.actuator_dynprm[4, 0] == pytest.approx(0.05 + half)
     play = compiled.joint("wrist_3_joint_backlash")
@@ -191,6 +191,40 @@ def test_a_servo_gives_way_as_much_as_the_cell_says(tmp_path: Path, on_top: bool
     assert ratio == pytest.approx(np.sqrt(wanted / kp), rel=1e-3)  # as well damped as before
 
 
+FRICTION = 'friction="10" damping="20"'  # a URDF's, as damping and friction may stand in it
+JOINT_EFFECTS = NOMINAL.with_terms([
+    Term("coulomb_friction", Site(1), (3.0,)), Term("viscous_friction", Site(1), (5.0,)),
+    Term("rotor_inertia", Site(1), (0.4,)),
+])  # fmt: skip
+
+
+@pytest.mark.parametrize("on_top", [False, True])
+def test_a_joint_that_has_friction_has_the_cells_instead_or_both_where_it_was_simulated(
+    tmp_path: Path, on_top: bool
+) -> None:
+    options = PatchOptions(on_top=on_top)
+    mine = mjcf(ARM, UR_JOINTS).replace(
+        'armature="0"', 'armature="0.1" damping="20" frictionloss="10"'
+    )
+    (tmp_path / "a.xml").write_text(mine)
+    (tmp_path / "a.urdf").write_text(
+        urdf(ARM, UR_JOINTS).replace("<limit", f"<dynamics {FRICTION}/><limit", 1)
+    )
+    xml, text = (
+        format_of(tmp_path / name)
+        .patch(tmp_path / name, changes_of(JOINT_EFFECTS), options, [])
+        .text
+        for name in ("a.xml", "a.urdf")
+    )
+    compiled = mujoco.MjModel.from_xml_string(xml)
+    own = (10.0, 20.0, 0.1) if on_top else (0.0, 0.0, 0.0)
+    dof = compiled.joint(UR_JOINTS[0]).dofadr[0]
+    assert compiled.dof_frictionloss[dof] == pytest.approx(3.0 + own[0])
+    assert np.ravel(compiled.dof_damping[dof])[0] == pytest.approx(5.0 + own[1])
+    assert compiled.dof_armature[dof] == pytest.approx(0.4 + own[2])
+    assert f'<dynamics friction="{3 + own[0]:g}" damping="{5 + own[1]:g}"/>' in text
+
+
 def test_a_delayed_actuator_moves_later(tmp_path: Path) -> None:
     model = NOMINAL.with_terms([Term("latency", Site(1), (0.02,))])
     text, _, _ = patched(tmp_path / "a.xml", mjcf(ARM, UR_JOINTS, kp=1e5), model, "tcp")
@@ -203,6 +237,20 @@ def test_a_delayed_actuator_moves_later(tmp_path: Path) -> None:
         mujoco.mj_step(compiled, data)
         moved.append(abs(data.joint(UR_JOINTS[0]).qpos[0]) > 1e-9)
     assert 19 <= moved.index(True) <= 23
+
+
+def test_the_history_of_a_delayed_actuator_is_filled_as_the_change_says(tmp_path: Path) -> None:
+    model = NOMINAL.with_terms([Term("latency", Site(1), (0.02,))])
+    text, changed, _ = patched(tmp_path / "a.xml", mjcf(ARM, UR_JOINTS, kp=1e5), model, "tcp")
+    assert any("delay 0.02 s; after a reset fill its history" in line for line in changed)
+    compiled = mujoco.MjModel.from_xml_string(text)
+    compiled.opt.gravity[:] = 0
+    data = mujoco.MjData(compiled)
+    data.qpos[:] = data.ctrl[:] = 1.0
+    nsample = mujoco.MjSpec.from_string(text).actuators[0].nsample
+    mujoco.mj_initCtrlHistory(compiled, data, 0, None, np.full(nsample, 1.0))
+    mujoco.mj_step(compiled, data, nstep=10)
+    assert data.qpos[0] == pytest.approx(1.0, abs=1e-9)
 
 
 def test_a_links_centre_moves_by_its_moment_over_its_mass(tmp_path: Path) -> None:
