@@ -22,6 +22,7 @@ from gapbridge.bridge.fleet.drift import (
 )
 from gapbridge.bridge.fleet.task import Outcome, by_arm, usable
 from gapbridge.core.diagnosis.channel_diagnosis import Verdict
+from gapbridge.core.effects import CATALOGUE
 
 GAP = "gap_rms"
 
@@ -116,13 +117,18 @@ def _recurrence(
     )  # fmt: skip
 
 
+def _is_moment(row: Mapping[str, Any]) -> bool:
+    """Return whether a row is a step's time, which is another one in each session."""
+    return CATALOGUE[row["effect"]].at_moment and row["unit"] == "s"
+
+
 def _series(arms: Mapping[str, Sequence[Outcome]]) -> Iterator[Series]:
     for arm, sessions in arms.items():
         times, per = session_times([o.result["time"] for o in sessions])
         values: dict[tuple[str, str, str], list[tuple[int, float, float]]] = defaultdict(list)
         for i, outcome in enumerate(sessions):
             for row in outcome.result["rows"]:
-                if row["accused"] and row["std"]:
+                if row["accused"] and row["std"] and not _is_moment(row):
                     key = (row["channel"], row["parameter"], row["unit"])
                     values[key].append((i, row["value"], row["std"]))
             for channel in outcome.result["channels"]:
@@ -178,7 +184,7 @@ def _parameter_outliers(done: Sequence[Outcome]) -> Iterator[Outlier]:
     values: dict[tuple[str, str, str], list[tuple[Outcome, float]]] = defaultdict(list)
     for outcome in done:
         for row in outcome.result["rows"]:
-            if row["accused"]:
+            if row["accused"] and not _is_moment(row):
                 key = (outcome.result["type"], row["parameter"], row["unit"])
                 values[key].append((outcome, row["value"]))
     for (_, name, unit), found in values.items():

@@ -22,7 +22,7 @@ from gapbridge.bridge.report.labels import counted
 from gapbridge.core.errors import InputError
 from gapbridge.core.files import require_utf8
 
-JOURNAL_VERSION = 2  # format of the results, part of every key
+JOURNAL_VERSION = 3  # format of the results, part of every key
 STATES = {BAD: "cannot be used", CRASHED: "failed", DIED: "killed their workers"}
 
 

@@ -76,7 +76,7 @@ def find_sessions(
 def natural_key(text: str) -> list[tuple[int, int, str]]:
     """Return a key that sorts ``s2`` before ``s10``."""
     return [
-        (0, int(part), "") if part.isdigit() else (1, 0, part)
+        (0, int(part), "") if part.isdecimal() else (1, 0, part)
         for part in re.split(r"(\d+)", text)
         if part
     ]

@@ -80,6 +80,7 @@ def _rows(channel: Mapping[str, Any]) -> list[dict[str, Any]]:
             {**shared, "parameter": p["name"], "value": p["value"], "std": p["std"],
              "unit": p["unit"]}
             for p in cause["parameters"]
+            if not isinstance(p["value"], str)  # a session's name, beside a moment without value
         ]  # fmt: skip
     rows += [
         {"channel": channel["channel"], "effect": k["effect"], "accused": False,

@@ -18,7 +18,13 @@ from gapbridge.bridge.fleet.output import (
     session_rows,
 )
 from gapbridge.bridge.fleet.runner import make_tasks
-from gapbridge.bridge.fleet.session import RESULTS_FILE, SESSIONS_FILE, Fleet, find_sessions
+from gapbridge.bridge.fleet.session import (
+    RESULTS_FILE,
+    SESSIONS_FILE,
+    Fleet,
+    find_sessions,
+    natural_key,
+)
 from gapbridge.bridge.fleet.task import BAD
 from gapbridge.core.errors import InputError
 from tests.bridge.fleet.jobs import count_rows
@@ -42,6 +48,10 @@ def test_the_first_folder_reports_the_arm_and_names_sort_by_their_numbers(tmp_pa
     assert list(arms_of(found).items()) == [("a/2026/s1", "a"), ("b/s9", "b"), ("b/s10", "b")]
     assert found.arms == 2
     assert "folder" in found.rule
+
+
+def test_a_digit_that_is_no_number_is_text() -> None:
+    assert sorted(["cell 10²3", "cell 9²3"], key=natural_key) == ["cell 9²3", "cell 10²3"]
 
 
 def test_of_logs_in_one_folder_the_name_reports_the_arm(tmp_path: Path) -> None:
