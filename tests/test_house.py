@@ -102,7 +102,6 @@ LIBRARIES_ATTRIBUTES = {
         "body.iquat", "body.mass", "body.name", "self.spec.comment",
         "self.spec.compiler.inertiafromgeom", "self.spec.compiler.settotalmass",
     },
-    "bridge/patch/usd_stage.py": {"self.layer.comment", "self.layer.defaultPrim"},
     "bridge/served/server.py": {"server.should_exit"},  # uvicorn
     "core/kernels/machine_code.py": {  # numba
         "counting.compile_nrt_functions", "environments._rebuild_env", "kept.FunctionCache",

@@ -237,11 +237,13 @@ class Stage:
     def text(self, comment: Sequence[str]) -> str:
         """Return the layer's text, the model's path relative to the layer's folder."""
         relative = Path(os.path.relpath(self.path.resolve(), self.folder.resolve())).as_posix()
-        self.layer.subLayerPaths[0] = relative if relative.startswith(".") else f"./{relative}"
-        self.layer.comment = "\n".join(comment)
+        layer = self.Sdf.Layer.CreateAnonymous(".usda")  # the stage would look for the path
+        layer.TransferContent(self.layer)
+        layer.subLayerPaths[0] = relative if relative.startswith(".") else f"./{relative}"
+        layer.comment = "\n".join(comment)
         if self.default:
-            self.layer.defaultPrim = self.default.GetName()
-        return str(self.layer.ExportToString())
+            layer.defaultPrim = self.default.GetName()
+        return str(layer.ExportToString())
 
 
 def _matrix(w: float, xyz: Any) -> Array:

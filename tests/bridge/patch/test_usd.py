@@ -146,6 +146,16 @@ def test_bodies_stand_where_the_joints_have_them(tmp_path: Path, nested: bool) -
     assert np.allclose(BASE_TURN.inv().apply(at - BASE_AT), expected, rtol=0, atol=1e-5)
 
 
+def test_a_patch_from_another_folder_warns_of_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(elsewhere)
+    stage, _ = patched(tmp_path, NOMINAL.with_terms(GEOMETRY))
+    assert stage.GetPrimAtPath("/arm/link_6")
+    assert capfd.readouterr().err == ""
+
+
 def test_a_tcp_that_the_stage_lacks_is_refused_also_where_it_stays(tmp_path: Path) -> None:
     write_stage(tmp_path / "a.usda", ARM, 1.0, nested=False)
     kind, options = format_of(tmp_path / "a.usda"), PatchOptions(tcp="tpc")
