@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from xml.sax.saxutils import escape, unescape
 
 import numpy as np
 
@@ -23,6 +25,8 @@ from gapbridge.core.rotation import roll_pitch_yaw
 from gapbridge.core.urdf import axis_of, checked_urdf, numbers_of, origin_of
 
 REVOLUTE = ("revolute", "continuous")
+FILES = re.compile(r"<(?:mesh|texture)\b[^>]*?\bfilename\s*=\s*([\"'])(.*?)\1", re.DOTALL)
+QUOTES = {'"': "&quot;", "'": "&apos;"}
 INSTEAD = {
     Kind.ARMATURE: "rotor inertia: set the armature where the simulator has it",
     Kind.DELAY: "delay: in the controller, or the simulator's actuator",
@@ -58,6 +62,7 @@ class Urdf(ModelFormat):
         changed += inertials
         missing = [*without_mass, *_tool(document, path, changes, options, world, frames, changed),
                    *_springs(changes), *_settings(changes)]  # fmt: skip
+        document.rebase(options.folder or path.parent)
         document.comment(["Patched by gapbridge.", *changed, *notes,
                           *(f"not in this file: {line}" for line in missing)])  # fmt: skip
         return Patched(document.text, tuple(changed), tuple(missing))
@@ -174,6 +179,16 @@ class _Document:
             start = element.start()
             rewritten = text[:start] + written + text[start + len(old) :]
         self.text = self.text[:begin] + rewritten + self.text[end:]
+
+    def rebase(self, folder: Path) -> None:
+        """Write paths of meshes and textures, relative to the file's folder, for another folder."""
+        old, new = self.path.parent.resolve(), folder.resolve()
+        for found in reversed(list(FILES.finditer(_without_comments(self.text)))):
+            name = unescape(found[2], {entity: sign for sign, entity in QUOTES.items()})
+            if old == new or os.path.isabs(name) or not (old / name).is_file():
+                continue  # also package://, which the simulator resolves
+            moved = escape(os.path.relpath(old / name, new), QUOTES)
+            self.text = self.text[: found.start(2)] + moved + self.text[found.end(2) :]
 
     def comment(self, lines: Sequence[str]) -> None:
         """Insert lines as a comment at the start of <robot>."""

@@ -45,3 +45,21 @@ def test_joints_and_links_in_comments_are_left_as_they_are(tmp_path: Path) -> No
     assert older in text
     assert elements(text) == elements(patched(tmp_path / "plain.urdf", given))
     assert elements(text) != elements(given)
+
+
+def test_meshes_beside_a_urdf_are_found_from_another_folder(tmp_path: Path) -> None:
+    (tmp_path / "model" / "meshes").mkdir(parents=True)
+    (tmp_path / "model" / "meshes" / "a & b.stl").touch()
+    names = ("meshes/a &amp; b.stl", "package://arm/a.stl", "meshes/missing.stl")
+    visuals = "".join(
+        f'<visual><geometry><mesh scale="1 1 1" filename="{name}"/></geometry></visual>'
+        for name in names
+    )
+    given = urdf(ARM, UR_JOINTS).replace("</link>", f"{visuals}<!-- {visuals} --></link>", 1)
+    path = tmp_path / "model" / "a.urdf"
+    path.write_text(given, encoding="utf-8")
+    options = PatchOptions(folder=tmp_path / "out")
+    text = format_of(path).patch(path, changes_of(Model(ARM).with_terms(CHANGES)), options, []).text
+    found = [mesh.get("filename") for mesh in ElementTree.fromstring(text).iter("mesh")]
+    assert found == ["../model/meshes/a & b.stl", *names[1:]]
+    assert visuals in text  # the comment
