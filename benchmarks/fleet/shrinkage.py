@@ -53,7 +53,7 @@ def run_fleet(model: Model, metrology: Metrology, poses: list[int], seed: int) -
     ways: dict[str, list[float]] = {"cell": [], "type alone": [], "separate": [], "fleet": []}
     for i in range(len(poses)):
         flexibility = {
-            "cell": np.zeros(2 * n), "type alone": np.maximum(fit.scatter.mean, 0),
+            "cell": np.zeros(2 * n), "type alone": fit.scatter.mean,
             "separate": _separate(model, seen[i], metrology),
             "fleet": fit.arms[i].flexibility,
         }  # fmt: skip

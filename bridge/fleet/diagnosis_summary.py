@@ -181,13 +181,14 @@ def _outliers(done: Sequence[Outcome]) -> list[Outlier]:
 
 
 def _parameter_outliers(done: Sequence[Outcome]) -> Iterator[Outlier]:
-    values: dict[tuple[str, str, str], list[tuple[Outcome, float]]] = defaultdict(list)
+    rows: dict[tuple[str, str, str], list[tuple[Outcome, Mapping[str, Any]]]] = defaultdict(list)
     for outcome in done:
         for row in outcome.result["rows"]:
             if row["accused"] and not _is_moment(row):
                 key = (outcome.result["type"], row["parameter"], row["unit"])
-                values[key].append((outcome, row["value"]))
-    for (_, name, unit), found in values.items():
-        for i, median, deviations in median_outliers([v for _, v in found], ratios=False):
-            outcome, value = found[i]
-            yield Outlier(outcome.arm, outcome.session, name, value, median, unit, deviations)
+                rows[key].append((outcome, row))
+    for (_, name, unit), found in rows.items():
+        values, stds = [row["value"] for _, row in found], [row["std"] for _, row in found]
+        for i, median, deviations in median_outliers(values, ratios=False, stds=stds):
+            outcome = found[i][0]
+            yield Outlier(outcome.arm, outcome.session, name, values[i], median, unit, deviations)

@@ -141,11 +141,14 @@ class Outlier:
     deviations: float
 
 
-def median_outliers(values: Sequence[float], *, ratios: bool) -> list[tuple[int, float, float]]:
+def median_outliers(
+    values: Sequence[float], *, ratios: bool, stds: Sequence[float | None] = ()
+) -> list[tuple[int, float, float]]:
     """Return (index, median, deviations) of the values far from the median.
 
     ``ratios``: values are positive and compared by their logarithm. Deviations are in units of the
-    scaled median absolute deviation; if that is zero, there are no outliers.
+    scaled median absolute deviation, with a value's own 1 sigma (``stds``, where known) added in
+    squares; if the first is zero, there are no outliers.
     """
     data = np.array(values, dtype=float)
     if len(data) < MIN_VALUES:
@@ -156,7 +159,8 @@ def median_outliers(values: Sequence[float], *, ratios: bool) -> list[tuple[int,
     if spread <= 0:
         return []
     median = math.exp(middle) if ratios else middle
-    deviations = (scaled - middle) / spread
+    own = np.array([std or 0.0 for std in stds] or 0.0)
+    deviations = (scaled - middle) / np.hypot(spread, own)
     return [
         (int(i), median, float(deviations[i]))
         for i in np.flatnonzero(np.abs(deviations) > OUTLIER_DEVIATIONS)

@@ -13,7 +13,7 @@ from scipy.stats import norm
 from gapbridge.bridge.document.json_text import finite
 from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Figure, Outlier, significant
 from gapbridge.bridge.fleet.task import Outcome, by_arm
-from gapbridge.core.arrays import Array
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.effects import flexibility_names
 from gapbridge.core.estimation.hierarchical import ArmFit, Scatter, SessionFit, TypeFit, fit_type
 from gapbridge.core.estimation.hierarchical_evidence import Evidence
@@ -56,6 +56,19 @@ class FittedType:
     parameters: tuple[str, ...]  # (2n,)
     scatter: Scatter
     arms: tuple[FittedArm, ...]
+
+    @property
+    def has_size(self) -> Mask:
+        """Return which flexibilities (2n,) exceed their own 1 sigma; of others no share is told."""
+        std = np.sqrt(np.diag(self.scatter.covariance))
+        return np.asarray(self.scatter.identifiable & (self.scatter.mean > std))
+
+    @property
+    def spread(self) -> float | None:
+        """Return the median scatter between arms, as a share; None: no flexibility has a size."""
+        known = self.has_size
+        shares = self.scatter.between_arms[known] / self.scatter.mean[known]
+        return float(np.median(shares)) if len(shares) else None
 
 
 @dataclass(frozen=True)

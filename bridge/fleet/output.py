@@ -14,7 +14,7 @@ import numpy as np
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.saving import cell_text
-from gapbridge.bridge.document.numbers import with_unit
+from gapbridge.bridge.document.numbers import percent, with_unit
 from gapbridge.bridge.document.output_file import write_text, write_together
 from gapbridge.bridge.document.provenance import fitted, intervals_of, provenance
 from gapbridge.bridge.fleet.diagnosis_summary import FleetDiagnosis, summarise
@@ -124,7 +124,6 @@ def _fit_lines(summary: FleetFit) -> list[str]:
     lines = []
     for kind in summary.types:
         shown = kind.scatter.identifiable
-        spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
         before, after = (
             float(np.sqrt(np.mean([getattr(s, name) ** 2 for a in kind.arms for s in a.sessions])))
             for name in ("gap_before", "gap_held_out")
@@ -132,14 +131,10 @@ def _fit_lines(summary: FleetFit) -> list[str]:
         lines.append(
             f"{type_title(kind.name)}: {counted(len(kind.arms), 'arm')}, "
             f"{int(shown.sum())} of {len(shown)} flexibilities identifiable, scatter between arms "
-            f"{_percent(spread)}; gap {with_unit(before, 'm')} with the cells, "
+            f"{percent(kind.spread)}; gap {with_unit(before, 'm')} with the cells, "
             f"{with_unit(after, 'm')} as predicted by the other sessions"
         )
     return lines + _drift_and_outlier_lines(summary)
-
-
-def _percent(spread: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
-    return f"{100 * float(np.median(spread)):.0f} %" if len(spread) else "not identifiable"
 
 
 def _drift_and_outlier_lines(summary: FleetDiagnosis | FleetFit) -> list[str]:

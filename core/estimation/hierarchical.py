@@ -43,7 +43,7 @@ MIN_SCATTER, MAX_SCATTER = 0.01, 2.0  # bounds of relative scatters
 class Scatter:
     """The type: its flexibilities, and how arms and sessions scatter about them."""
 
-    mean: Array  # (2n,) rad/Nm
+    mean: Array  # (2n,) rad/Nm, not below zero
     covariance: Array  # (2n, 2n) of the mean
     between_arms: Array  # (2n,) rad/Nm, 1 sigma
     between_sessions: Array  # (2n,) rad/Nm, 1 sigma
@@ -114,9 +114,9 @@ def fit_type(
         type_fit = _averaged(samples)
     typical = float(np.sqrt(np.median(noise)))
     scatter = Scatter(
-        type_fit.mean * usual, type_fit.covariance * usual**2, np.sqrt(type_fit.tau) * usual,
-        np.sqrt(type_fit.omega) * usual, typical, data.arms, len(sessions),
-        identifiable(type_fit.covariance),
+        np.maximum(type_fit.mean, 0) * usual, type_fit.covariance * usual**2,
+        np.sqrt(type_fit.tau) * usual, np.sqrt(type_fit.omega) * usual, typical, data.arms,
+        len(sessions), identifiable(type_fit.covariance),
     )  # fmt: skip
     return TypeFit(
         scatter, tuple(_arms(data, type_fit, samples, usual)),

@@ -115,6 +115,14 @@ def test_arms_with_few_poses_gain_by_borrowing_and_their_intervals_hold() -> Non
     assert 0.91 < np.mean(inside) < 0.985
 
 
+def test_a_flexibility_of_a_type_is_not_negative() -> None:
+    stiff = MEAN * [1, 0, 1, 1]
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        fit = fit_type([reported(stiff, rng) for _ in range(4)], [0, 1, 2, 3], np.zeros(4), USUAL)
+        assert (fit.scatter.mean >= 0).all()
+
+
 def test_scatter_between_arms_and_noise_are_found() -> None:
     fit, truths, _ = fleet(90, 3, 5)
     scatter = fit.scatter

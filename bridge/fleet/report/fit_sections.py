@@ -14,6 +14,7 @@ from gapbridge.bridge.fleet.fit_summary import FittedArm, FittedSession, FittedT
 from gapbridge.bridge.fleet.report.shared_sections import MAX_ROWS, type_title
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.bridge.report.labels import counted, parameter_title
+from gapbridge.core.arrays import Array
 
 SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "predicted by the others")
 MICRO = 1e6
@@ -37,11 +38,9 @@ def _lead(kind: FittedType) -> str:
         with_unit(float(np.sqrt(np.mean([getattr(s, name) ** 2 for s in sessions]))), "m")
         for name in ("gap_before", "gap_after", "gap_held_out")
     )
-    shown = kind.scatter.identifiable
-    spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
     scatter = (
-        f"Arms of the type scatter by {percent(float(np.median(spread)))}." if len(spread)
-        else "No flexibility is identifiable."
+        "No flexibility exceeds its own uncertainty." if kind.spread is None
+        else f"Arms of the type scatter by {percent(kind.spread)}."
     )  # fmt: skip
     return (
         f"{type_title(kind.name)}: {counted(len(kind.arms), 'arm')}, "
@@ -71,14 +70,20 @@ def _parameter(kind: FittedType, j: int) -> list[blocks.Cell]:
     if not scatter.identifiable[j]:
         return [parameter_title(kind.parameters[j]), "not identifiable from any session", "–", "–"]
     mean, std = scatter.mean[j] * MICRO, np.sqrt(scatter.covariance[j, j]) * MICRO
-    share = [float(s[j] / max(scatter.mean[j], 1e-12))
-             for s in (scatter.between_arms, scatter.between_sessions)]  # fmt: skip
     repeated = scatter.sessions > scatter.arms
     return [
         parameter_title(kind.parameters[j]), f"{number(mean)} ± {number(std, 2)} µrad/Nm",
-        blocks.Bar(share[0], percent(share[0])),
-        blocks.Bar(share[1], percent(share[1]), EDGE) if repeated else "–",
+        _share(kind, j, scatter.between_arms, AFTER),
+        _share(kind, j, scatter.between_sessions, EDGE) if repeated else "–",
     ]  # fmt: skip
+
+
+def _share(kind: FittedType, j: int, scatter: Array, colour: str) -> blocks.Cell:
+    """Return a scatter (2n,) of a flexibility, as a share of the type's where that has a size."""
+    if not kind.has_size[j]:
+        return f"{number(float(scatter[j]) * MICRO, 2)} µrad/Nm"
+    share = float(scatter[j] / kind.scatter.mean[j])
+    return blocks.Bar(share, percent(share), colour)
 
 
 def arms(summary: FleetFit) -> list[blocks.Block]:
@@ -103,9 +108,10 @@ def _arm(kind: FittedType, arm: FittedArm) -> list[blocks.Cell]:
     far = "–"
     if len(shown):
         j = int(shown[np.argmax(np.abs(arm.fit.beside_type[shown]))])
-        more = arm.fit.flexibility[j] / max(kind.scatter.mean[j], 1e-12) - 1
-        far = (f"{parameter_title(kind.parameters[j])}: "
-               f"{percent(abs(float(more)))} {'more' if more > 0 else 'less'}")  # fmt: skip
+        more = float(arm.fit.flexibility[j] - kind.scatter.mean[j])
+        size = (percent(abs(more) / float(kind.scatter.mean[j])) if kind.has_size[j]
+                else f"{number(abs(more) * MICRO, 2)} µrad/Nm")  # fmt: skip
+        far = f"{parameter_title(kind.parameters[j])}: {size} {'more' if more > 0 else 'less'}"
     return [blocks.Strong(arm.name), str(len(arm.sessions)), str(arm.poses),
             blocks.Bar(own, percent(own)), far]  # fmt: skip
 

@@ -55,17 +55,18 @@ def _by_chance(p_value: float) -> str:
 
 
 def _drift_chart(found: Sequence[Drift]) -> Drawing:
-    """Return a chart of drifts, each relative to its first session."""
+    """Return a chart of drifts: changes since the first session, which can be at zero."""
     per_day = {d.per for d in found} == {"day"}
     x = [np.array(d.times) + (0 if d.per == "day" else 1) for d in found]
     y = [
-        (np.array(d.value) - d.value[0]) / max(abs(d.value[0]), 1e-300) * 100 for d in found
+        (np.array(d.value) - d.value[0]) / (max(map(abs, d.value)) or 1.0) * 100 for d in found
     ]  # fmt: skip
     chart = Chart(
         "Change since the first session",
         scale("days since the first session" if per_day else "session of the arm",
               [v for one in x for v in one], zero=False),
-        scale("change, %", [v for one in y for v in one]), width=430, height=260,
+        scale("change, % of the largest value", [v for one in y for v in one]),
+        width=430, height=260,
     )  # fmt: skip
     for drift, times, change, colour in zip(found, x, y, COLOURS, strict=False):
         chart.line([*times], [*change], colour)

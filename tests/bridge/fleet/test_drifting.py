@@ -66,3 +66,11 @@ def test_a_value_far_from_the_median_is_reported_with_the_usual_one() -> None:
 def test_few_or_equal_values_have_no_outliers() -> None:
     assert median_outliers([1.0, 1.0, 1.0, 50.0], ratios=False) == []
     assert median_outliers([1.0] * 20 + [50.0], ratios=False) == []
+
+
+def test_a_value_that_its_own_sigma_explains_is_no_outlier() -> None:
+    values = [*np.random.default_rng(2).normal(3e-6, 1e-7, 11), 2e-6]
+    assert [i for i, _, _ in median_outliers(values, ratios=False)] == [11]
+    assert median_outliers(values, ratios=False, stds=[1e-7] * 11 + [4e-7]) == []
+    sure = median_outliers(values, ratios=False, stds=[None] * 11 + [1e-7])
+    assert [i for i, _, _ in sure] == [11]
