@@ -152,8 +152,15 @@ def base_in_world(cell_axes: Axes, model_axes: Axes, source: str, names: tuple[s
 
     The rotation that aligns the directions of the cell's axes with the model's (Kabsch), then the
     shift that aligns the lines (least squares). Raises InputError, naming the first joint whose
-    axis does not agree: the model is of another arm, or has another zero.
+    axis does not agree: the model is of another arm, or has another zero; and where all axes are
+    parallel, which determine neither a turn about them nor a shift along them.
     """
+    parallel = np.linalg.norm(np.cross(cell_axes.direction, cell_axes.direction[0]), axis=1)
+    if parallel.max() < MAX_ANGLE:
+        raise InputError(
+            f"{source}: joints {', '.join(names)}: found axes that are all parallel, expected two "
+            "directions: these do not show where the model has the cell's base"
+        )
     U, _, Vt = np.linalg.svd(model_axes.direction.T @ cell_axes.direction)
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     across = np.array([np.eye(3) - np.outer(d, d) for d in model_axes.direction])

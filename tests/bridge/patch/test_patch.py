@@ -19,7 +19,7 @@ from benchmarks.patch.arms import (
     written_arms,
 )
 from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
-from gapbridge.core.arm import builtin_arm
+from gapbridge.core.arm import arm_from_dh, builtin_arm
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
@@ -285,6 +285,16 @@ def test_another_arm_is_refused_by_the_joint_that_does_not_agree(tmp_path: Path)
         format_of(tmp_path / "a.urdf").patch(
             tmp_path / "a.urdf", changes_of(NOMINAL), PatchOptions(), []
         )
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_an_arm_whose_axes_are_all_parallel_is_refused(tmp_path: Path, n: int) -> None:
+    """Its base could be anywhere along them; one joint was patched as if turned."""
+    rows = [{"a": 0.4, "alpha": 0.0, "d": 0.1, "mass": 2.0} for _ in range(n)]
+    arm, names = arm_from_dh(rows), UR_JOINTS[:n]
+    (path := tmp_path / "a.xml").write_text(mjcf(arm, names))
+    with pytest.raises(InputError, match=r"a\.xml: joints shoulder_pan.* all parallel, expected"):
+        format_of(path).patch(path, changes_of(Model(arm)), PatchOptions(joints=names), [])
 
 
 @pytest.mark.parametrize(
