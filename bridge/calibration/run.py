@@ -215,6 +215,10 @@ def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
         )
     prompt.say(f"instrument: {instrument.name}; joints: {_joints_text(joints, options)}")
     prompt.say("at every question: Enter continues, `undo`, `back`, `skip`, `quit`, `?`")
+    earlier = () if job.session.used_sources else instrument.earlier(joints.detects_rest)
+    if earlier:  # a plan of the same seed has the same stops: they would fit the arm of that time
+        job.session.add("rejected", sources=earlier, reasons=["of before the session"])
+        prompt.warn(f"readings from before this session are not used: {len(earlier)}")
     positioning = Positioning(
         prompt, job.session, joints, instrument, _collision_check(job), settings
     )
@@ -226,7 +230,7 @@ def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
 
 def _collision_check(job: Job) -> CollisionCheck:
     assert job.session.plan is not None
-    workspace = with_loads(workspace_of(job.cell, "position"), job.session.plan.loads)
+    workspace = with_loads(workspace_of(job.cell, "position", 0.0), job.session.plan.loads)
     return lambda q: np.asarray(workspace.clear(q), dtype=float)
 
 

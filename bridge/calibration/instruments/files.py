@@ -37,6 +37,12 @@ class Row:
     cells: tuple[str, ...]
     stop: int | None  # from 1; None: no column ``stop``
 
+    @property
+    def source(self) -> str:
+        """Return the row's name; of a stop's row with its text, so that a corrected one is new."""
+        text = "" if self.stop is None else f": {' '.join(self.cells)}"
+        return f"row {self.line}{text}"
+
 
 @dataclass(frozen=True)
 class Table:
@@ -72,6 +78,9 @@ class Table:
                 f"{self.path}: column {missing[0]}: found none, expected one of "
                 f"{', '.join(self.names) or 'a header'}"
             )
+        twice = [name for name in columns if self.names.count(name) > 1]
+        if twice:  # nominal and measured, for instance
+            raise InputError(f"{self.path}: column {twice[0]}: found it twice, expected it once")
         return tuple(row.cells[self.names.index(name)] for name in columns)
 
 
@@ -175,6 +184,13 @@ class ReadingsFile(_ExportedReadings[FileSettings]):
         if file.exists():
             read_table(file)
 
+    def earlier(self, live: bool) -> tuple[str, ...]:
+        """Return the rows that are there already: all of a file from before the session."""
+        file = self.settings.file
+        if not file.exists() or not (live or file.stat().st_mtime < self.context.since):
+            return ()
+        return tuple(row.source for row in read_table(file).rows)
+
     def _timeout_message(self, request: ReadRequest) -> str:
         file, timeout = self.settings.file, self.settings.timeout
         return f"{file}: found no new row for {timeout:g} s, expected stop {request.stop}"
@@ -186,15 +202,15 @@ class ReadingsFile(_ExportedReadings[FileSettings]):
         row = _next_row(table, request)
         if row is None:
             return None
-        return Samples(self._coordinates(table, row)[np.newaxis], f"row {row.line}")
+        return Samples(self._coordinates(table, row)[np.newaxis], row.source)
 
 
 def _next_row(table: Table, request: ReadRequest) -> Row | None:
-    rows = [r for r in table.rows if f"row {r.line}" not in request.used]
-    if any(r.stop is not None for r in table.rows):
-        matching = [r for r in table.rows if r.stop == request.stop]
-        return matching[-1] if matching else None
-    return rows[0] if rows else None
+    if any(r.stop is not None for r in table.rows):  # its last row; an earlier one was replaced
+        rows = [r for r in table.rows if r.stop == request.stop][-1:]
+    else:
+        rows = list(table.rows)
+    return next((r for r in rows if r.source not in request.used), None)
 
 
 class WatchedFolder(_ExportedReadings[FolderSettings]):
@@ -215,6 +231,11 @@ class WatchedFolder(_ExportedReadings[FolderSettings]):
                 f"{self.settings.folder}: found no such folder, expected the one that the "
                 "tracker's software writes to"
             )
+
+    def earlier(self, live: bool) -> tuple[str, ...]:
+        """Return the files that are there already; older ones than the session are never read."""
+        folder, pattern = self.settings.folder, self.settings.pattern
+        return tuple(sorted(path.name for path in folder.glob(pattern))) if live else ()
 
     def _timeout_message(self, request: ReadRequest) -> str:
         folder, pattern = self.settings.folder, self.settings.pattern

@@ -89,6 +89,13 @@ class Instrument(ABC, Generic[S]):
         Raises ReadingError if a reading is invalid, LinkError if the connection is lost.
         """
 
+    def earlier(self, live: bool) -> tuple[str, ...]:
+        """Return the sources of readings from before the session's first question.
+
+        ``live``: the arm is read as well, so that none of those that are there can be of it.
+        """
+        return ()
+
     def set_load(self, load: Payload) -> None:
         """Note the load that was mounted; a simulated instrument mounts it in the simulation.
 

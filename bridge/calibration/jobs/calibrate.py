@@ -151,11 +151,19 @@ class CalibrationJob(Job):
         from gapbridge.bridge.calibration.jobs.facts import (
             session_facts,  # plotting is slow to import
         )
-        from gapbridge.bridge.calibration.report import CalibrationData, write_report
+        from gapbridge.bridge.calibration.report import (
+            CalibrationData,
+            required_accuracy,
+            write_report,
+        )
 
         facts = session_facts(self.cell, options, self.session)
-        for file in write_report(CalibrationData(result, self.session.plan, facts), folder):
+        data = CalibrationData(result, self.session.plan, facts)
+        for file in write_report(data, folder):
             prompt.say(f"{file}: written")
+        if facts.accuracy is not None:
+            verdict = required_accuracy(data)
+            prompt.say(f"{verdict.badge.text}: {verdict.text}", "bold")
         if not result.complete:
             prompt.warn(f"not complete: {note_text(result.remaining)}")
         if (why := worse_than_before(result.held_out_before, result.held_out_after)) is not None:

@@ -3,6 +3,7 @@
 from gapbridge.bridge.calibration.report.data import CalibrationData
 from gapbridge.bridge.calibration.report.facts import InstrumentFacts, SessionFacts
 from gapbridge.bridge.calibration.report.report import write_report
+from gapbridge.bridge.calibration.report.sections.result_section import required_accuracy
 from gapbridge.bridge.calibration.report.sections.short_sections import ShortSessionData
 from gapbridge.bridge.calibration.report.sections.verification_sections import VerificationData
 
@@ -12,5 +13,6 @@ __all__ = [
     "SessionFacts",
     "ShortSessionData",
     "VerificationData",
+    "required_accuracy",
     "write_report",
 ]

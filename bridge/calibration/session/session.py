@@ -116,7 +116,7 @@ class Session:
             case "ended":
                 self.has_ended = True
             case "rejected":
-                self.used_sources.add(entry.get("source", ""))
+                self.used_sources |= {entry.get("source", ""), *entry.get("sources", ())}
             case "undo":
                 self.undone += 1
                 self.has_ended = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -293,6 +294,38 @@ def test_a_verification_accepts_the_arm_and_detects_a_bent_tool(
         if bend:  # an old session that is evaluated again says nothing of the arm today
             assert run_calibrate(cell, "--verify", "--session", tmp_path / "a").code == 0
             assert "the tool moved by" in read_mark(cell)
+
+
+def test_a_verification_does_not_pass_by_the_readings_of_the_one_before(
+    clean: tuple[Path, CommandResult], tmp_path: Path
+) -> None:
+    cell, file, plan = clean[0] / "new.yaml", tmp_path / "readings.csv", tmp_path / "p"
+    given = ("--verify", "--instrument", f"file,unit=m,file={file},timeout=0.2")
+    assert run_calibrate(cell, *given, "--plan-only", "--session", plan).code == 0
+    stops = plan_in(plan)
+    rows = [f"{i + 1},{reading_line(v)}" for i, v in enumerate(_verified(stops, 0.0))]
+    file.write_text("\n".join(["stop,x,y,z", *rows]).replace(" ", ",") + "\n", encoding="utf-8")
+    again = run_calibrate(cell, *given, "--session", plan, lines=["", "", ""])
+    assert "the calibration holds" in again.out, again.err
+    os.utime(file, (0, 0))
+    later = run_calibrate(cell, *given, "--session", tmp_path / "s", lines=["", "quit"])
+    assert "from before this session are not used: 10" in later.out
+    assert "found no new row for 0.2 s, expected stop 1" in later.out
+    assert "  kept  " not in later.out
+    resumed = run_calibrate(cell, *given, "--session", tmp_path / "s", lines=["", "quit"])
+    assert "found no new row for 0.2 s, expected stop 1" in resumed.out
+
+
+def test_a_missed_accuracy_is_told_before_the_cell_is_written(
+    clean: tuple[Path, CommandResult], tmp_path: Path
+) -> None:
+    text = (clean[0] / "cell.yaml").read_text(encoding="utf-8")
+    shutil.copytree(clean[0] / "s", tmp_path / "s")
+    for accuracy, word in (("1.0e-5", "Fail: Required"), ("1.0e-3", "Pass: Required")):
+        cell = tmp_path / "cell.yaml"
+        cell.write_text(f"{text}  accuracy: {accuracy}\n", encoding="utf-8")
+        result = run_calibrate(cell, "--session", tmp_path / "s", lines=["no"])
+        assert word in result.out[: result.out.index("[yes/no]")], result.err
 
 
 def test_a_few_poses_neither_pass_a_verification_nor_remove_the_mark(

@@ -63,7 +63,7 @@ def summary(data: CalibrationData) -> list[blocks.Block]:
         text += (
             f" Outliers (reading {rows}) are to be measured again; the uncertainty excludes them."
         )
-    required = [] if data.session.accuracy is None else [_required_accuracy(data)]
+    required = [] if data.session.accuracy is None else [required_accuracy(data)]
     return [
         blocks.Verdict(badge, sentence(calibration_text(c, parameter_title))), *required,
         blocks.Heading("What to do now"), blocks.Bullets(tuple(next_steps(data))),
@@ -103,7 +103,7 @@ def next_steps(data: CalibrationData) -> list[str]:
     ]
 
 
-def _required_accuracy(data: CalibrationData) -> blocks.Verdict:
+def required_accuracy(data: CalibrationData) -> blocks.Verdict:
     """Return whether the required accuracy is met by the largest error of a held-out pose."""
     required = data.session.accuracy or 0.0
     after = data.calibration.held_out_after

@@ -161,7 +161,14 @@ def test_a_file_with_stops_gives_each_stop_its_last_row(tmp_path: Path) -> None:
     file = tmp_path / "readings.csv"
     file.write_text("stop,x,y,z\n1,1,0,0\n2,2,0,0\n1,3,0,0\n", encoding="utf-8")
     reader = instrument("file", unit="m", file=str(file), timeout=0.2)
-    assert reader.read(ReadRequest(stop=1)).values[0, 0] == 3.0
+    first = reader.read(ReadRequest(stop=1))
+    assert first.values[0, 0] == 3.0
+    again = ReadRequest(stop=1, used=frozenset({first.source}))  # discarded: neither row any more
+    with pytest.raises(ReadingError, match=r"no new row .* expected stop 1"):
+        reader.read(again)
+    text = file.read_text(encoding="utf-8")
+    file.write_text(text.replace("1,3,0,0", "1,3.5,0,0"), encoding="utf-8")
+    assert reader.read(again).values[0, 0] == 3.5  # corrected in its place
     assert reader.read(ReadRequest(stop=2)).values[0, 0] == 2.0
     with pytest.raises(ReadingError, match=r"no new row .* expected stop 3"):
         reader.read(ReadRequest(stop=3))
@@ -218,6 +225,22 @@ def test_columns_are_found_by_name_and_a_missing_one_is_reported(tmp_path: Path)
     np.testing.assert_allclose(reader.values, [[1, 2, 3]])
     with pytest.raises(InputError, match="column w: found none"):
         instrument("file", columns=("w", "y", "z"), **keys).read(ReadRequest())
+    file.write_text("x,y,z,x,y,z\n1,2,3,1.1,2.1,3.1\n", encoding="utf-8")  # nominal, measured
+    with pytest.raises(InputError, match="column x: found it twice"):
+        instrument("file", columns=("x", "y", "z"), **keys).read(ReadRequest())
+
+
+def test_readings_from_before_a_session_are_known(tmp_path: Path) -> None:
+    file, now = tmp_path / "readings.csv", time.time()
+    file.write_text("x,y,z\n1,2,3\n4,5,6\n", encoding="utf-8")
+    os.utime(file, (now - 60, now - 60))
+    keys = {"unit": "m", "file": str(file)}
+    assert instrument("file", since=now - 30, **keys).earlier(False) == ("row 2", "row 3")
+    assert instrument("file", since=now - 90, **keys).earlier(False) == ()  # a complete file
+    assert instrument("file", since=now - 90, **keys).earlier(True) == ("row 2", "row 3")
+    folder = instrument("folder", unit="m", folder=str(tmp_path))
+    assert (folder.earlier(False), folder.earlier(True)) == ((), ("readings.csv",))
+    assert instrument("typed", unit="m").earlier(True) == ()
 
 
 def test_a_watched_folder_gives_whole_new_files_oldest_first(tmp_path: Path) -> None:

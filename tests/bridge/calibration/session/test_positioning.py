@@ -96,16 +96,20 @@ def test_a_reading_is_typed_again_where_the_link_was_silent(
     np.testing.assert_array_equal(session.accepted[0].q, arm.q)
 
 
-def test_a_row_that_was_written_while_the_arm_moved_is_not_read_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stop", ["", "1,"])
+def test_a_row_that_was_written_while_the_arm_moved_is_not_read_again(
+    tmp_path: Path, stop: str
+) -> None:
     arm, session, file = ScriptedJoints(np.full(6, 0.1)), session_of(1), tmp_path / "readings.csv"
-    file.write_text("x,y,z\n1000,2000,300\n", encoding="utf-8")
+    title = "stop," if stop else ""
+    file.write_text(f"{title}x,y,z\n{stop}1000,2000,300\n", encoding="utf-8")
     settings = FileSettings(kind="file", file=file, unit="mm", timeout=0.01)
     instrument = ReadingsFile(settings, InstrumentContext(lambda question: ""))
 
     class Measured(ScriptedPrompt):
         def enter(self, question: str) -> None:  # to try again: the tracker measures once more
             with file.open("a", encoding="utf-8") as rows:
-                rows.write("1000.2,2000,300\n")
+                rows.write(f"{stop}1000.2,2000,300\n")
 
     def unmoved(sample: JointSample) -> bool:
         before, arm.q = sample.q, np.full(6, 0.1004)
