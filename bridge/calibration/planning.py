@@ -16,6 +16,7 @@ from gapbridge.bridge.cell.settings.calibration import (
     RangeEntry,
 )
 from gapbridge.bridge.cell.settings.instruments import Base
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.observable import Observable
@@ -25,6 +26,7 @@ from gapbridge.core.errors import InputError, PlanError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.planning.capsules import Box
 from gapbridge.core.planning.design import SessionDesign, load_extent, plan
+from gapbridge.core.planning.payload_plan import LIMIT_MARGIN
 from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, if the cell does not give it
@@ -103,11 +105,14 @@ def make_plan(cell: Cell, options: SessionOptions, emit: Callable[[str, float], 
         raise cell.error(error.keys or ("calibration",), error.message) from None
 
 
-def workspace_of(cell: Cell, kind: str) -> Workspace:
-    """Return where the arm may be measured with a kind of reading. Raises CellError."""
+def workspace_of(cell: Cell, kind: str, margin: float = LIMIT_MARGIN) -> Workspace:
+    """Return where the arm may be measured with a kind of reading. Raises CellError.
+
+    ``margin`` (rad) is kept to the arm's joint limits where the cell has no ``joint_range``.
+    """
     settings, entry = cell.calibration, cell.calibration.reflector
     places = _places(cell, kind)
-    lower, upper = _range(cell, settings.joint_range)
+    lower, upper = _range(cell, settings.joint_range, margin)
     boxes = [Box(_vector3(b.lower), _vector3(b.upper)) for b in _boxes(cell, settings)]
     optic = None
     if entry is not None:
@@ -177,12 +182,13 @@ def _boxes(cell: Cell, settings: CalibrationSettings) -> list[BoxEntry]:
     return list(settings.keep_out)
 
 
-def _range(
-    cell: Cell, settings: JointRange | None
-) -> tuple[list[float] | None, list[float] | None]:  # fmt: skip
-    if settings is None:
-        return None, None
-    n = cell.arm.n
+def _range(cell: Cell, settings: JointRange | None, margin: float) -> tuple[Array, Array]:
+    """Return the lowest and highest joints (n,), rad, of a session. Raises CellError."""
+    limits, n = cell.arm.limits, cell.arm.n
+    if settings is None:  # at its very limit a drive refuses a joint, or its brake engages
+        room = (limits.upper - limits.lower) / 4
+        kept = np.minimum(max(margin, cell.limits.joint_margin), room)
+        return limits.lower + kept, limits.upper - kept
     for name, values in (("lower", settings.lower), ("upper", settings.upper)):
         if len(values) != n:
             raise cell.error(
@@ -194,7 +200,7 @@ def _range(
                 ("calibration", "joint_range", "lower", i),
                 f"found {lower:g}, expected less than upper, {upper:g}",
             )
-    return settings.lower, settings.upper
+    return np.array(settings.lower), np.array(settings.upper)
 
 
 def _vector3(values: list[float]) -> tuple[float, float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -173,3 +174,21 @@ def test_loads_count_in_collision_checks(tmp_path: Path) -> None:
     q = bare.draw(2000, np.random.default_rng(0))
     assert (loaded.clear(q) & ~bare.clear(q)).sum() == 0
     assert loaded.clear(q).sum() < bare.clear(q).sum()
+
+
+def test_the_arms_limits_are_kept_clear_of_and_a_joint_range_is_used_as_it_is(
+    tmp_path: Path,
+) -> None:
+    def limits(*lines: str) -> tuple[np.ndarray, np.ndarray]:
+        cell = load_cell(cell_with(tmp_path, *lines))
+        lower, upper = np.full(6, -2.0), np.array([2.0] * 5 + [-1.96])
+        arm = replace(cell.arm, limits=replace(cell.arm.limits, lower=lower, upper=upper))
+        workspace = workspace_of(replace(cell, model=replace(cell.model, arm=arm)), "position")
+        return workspace.lower, workspace.upper
+
+    lower, upper = limits()
+    np.testing.assert_allclose(lower, [-1.95] * 5 + [-1.99])
+    np.testing.assert_allclose(upper, [1.95] * 5 + [-1.97])
+    lower, upper = limits(f"joint_range: {{lower: {[-2.0] * 6}, upper: {[-1.99] * 6}}}")
+    np.testing.assert_allclose(lower, [-2.0] * 6)
+    np.testing.assert_allclose(upper, [-1.99] * 6)
