@@ -155,12 +155,11 @@ class _InputLines:
 
     def __init__(self) -> None:
         self._buffer = b""
-        self.ended = False
+        self.ended = sys.stdin is None  # closed
 
     def _receive(self, wait: float) -> bool:
         """Return whether input arrived within ``wait`` s; it is added to the buffer."""
-        fd = sys.stdin.fileno()
-        if self.ended or not select.select([fd], [], [], wait)[0]:
+        if self.ended or not select.select([fd := sys.stdin.fileno()], [], [], wait)[0]:
             return False
         data = os.read(fd, 4096)
         self.ended = not data
@@ -172,8 +171,7 @@ class _InputLines:
 
         Input typed before a question was meant for another one.
         """
-        fd = sys.stdin.fileno()
-        if not os.isatty(fd):
+        if self.ended or not os.isatty(fd := sys.stdin.fileno()):
             return ""
         while self._receive(0.0):
             pass

@@ -68,3 +68,17 @@ def test_what_the_encoding_of_stdout_lacks_is_replaced(tmp_path: Path) -> None:
         main(["check", str(cell)])
     assert leaving.value.code == 0
     assert b"?.yaml: fit to be used" in content.getvalue()
+
+
+def test_a_closed_stdin_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(
+        "robot: {model: ur10e}\ncalibration: {joints: typed}\n", encoding="utf-8"
+    )  # the first question is where the arm stands
+    monkeypatch.setattr(sys, "stdin", None)
+    with pytest.raises(SystemExit) as leaving:
+        main(["calibrate", str(cell), "--tool-only", "--session", str(tmp_path / "s")])
+    assert leaving.value.code == 0
+    assert "the input ended" in capsys.readouterr().out
