@@ -28,7 +28,7 @@ import gapbridge.bridge.cli.log.diagnose as command
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.diagnosis import diagnosis as core
-from gapbridge.core.dynamics import predict_torque
+from gapbridge.core.dynamics import predict_wrench, with_pieces
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
@@ -42,25 +42,28 @@ def soft_log(folder: Path, model: Model = SOFT) -> Path:
     return log_in(folder, columns_of(q, loads) | measured(model, q, loads, noise=2e-5))
 
 
-def test_no_cause_of_misread_torques_is_written(tmp_path: Path) -> None:
-    """Torques of the wrong sign were first moments of 20 kg m; the positions' cause stays."""
+def test_no_cause_of_a_misread_sensor_is_written(tmp_path: Path) -> None:
+    """Of the wrong sign it showed another centre of gravity; the positions' cause stays."""
     q, loads = poses_and_loads(40)
-    torque = predict_torque(SOFT, Motion.at_rest(q, loads))
-    torque += np.random.default_rng(1).normal(0, 0.3, torque.shape)
+    loads = replace(loads, wrench=np.zeros((40, 6)))
+    at_rest = Motion.at_rest(q, loads)
+    wrench = -predict_wrench(SOFT, with_pieces(SOFT, at_rest))
+    wrench += np.random.default_rng(1).normal(0, 0.3, wrench.shape) * np.repeat([1, 0.1], 3)
     columns = columns_of(q, loads) | measured(SOFT, q, loads, noise=2e-5)
-    columns |= {f"actual_current_as_torque_{j}": -torque[:, j] for j in range(6)}
+    columns |= {f"ft_raw_wrench_{j}": wrench[:, j] for j in range(6)}
     log, new = log_in(tmp_path, columns), tmp_path / "new.yaml"
     answer = gapbridge("diagnose", log, "--cell", cell_in(tmp_path), "--apply", new)
     assert answer.code == 0, answer.err
     (line,) = answer.err.splitlines()
-    assert line.startswith(f"warning: {log}: actual_current_as_torque seems to have the wrong sign")
-    assert line.endswith("; no cause of torque is written into the cell")
+    assert line.startswith(f"warning: {log}: ft_raw_wrench seems to have the wrong sign")
+    assert line.endswith("; no cause of wrench is written into the cell")
+    assert "cause: payload_cog" in answer.out
     text = new.read_text(encoding="utf-8")
     assert "channel: position" in text
-    assert "channel: torque" not in text
-    written = load_cell(new)
-    assert not {"link_cog", "torque_constant"} & {term.effect for term in written.model.terms}
-    assert written.model.compliance()[0][1] == pytest.approx(2e-5, rel=0.1)
+    assert "channel: wrench" not in text
+    written = load_cell(new).model
+    assert "payload_cog" not in {term.effect for term in written.terms}
+    assert written.compliance()[0][1] == pytest.approx(2e-5, rel=0.1)
 
 
 def test_what_is_found_is_reported_written_and_predicts(tmp_path: Path) -> None:
