@@ -116,9 +116,8 @@ def stem_of(name: str) -> str:
 
 
 def _columns(log: Log) -> dict[str, Array]:
-    joints = log.get("actual_q")
     columns = {
-        "actual_q": log.get("target_q") if joints is None else joints,
+        "actual_q": log.get("actual_q", "target_q"),
         "payload": log.get("payload"),
         "joint_temperatures": log.get("joint_temperatures"),
         "actual_TCP_force": log.get("actual_TCP_force"),

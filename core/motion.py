@@ -289,8 +289,7 @@ def time_stretches(log: Log, count: int) -> Index | None:
     Pauses are left out. Neighbours in time share their errors, as repeats of a pose do. None for
     poses at rest, and where rows are not in time order.
     """
-    time, q = log.get("timestamp"), log.get("actual_q")
-    q = log.get("target_q") if q is None else q
+    time, q = log.get("timestamp"), log.get("actual_q", "target_q")
     if time is None or q is None or not (np.diff(time) >= 0).all():
         return None
     if not is_moving(time, q, log.get("actual_qd")):

@@ -137,7 +137,7 @@ def _check_kinds(logs: Sequence[Log]) -> None:
     """Raise LogError where recordings of motion and poses at rest are mixed."""
     kinds: dict[bool, str] = {}
     for log in logs:
-        q = log.columns.get("actual_q", log.columns.get("target_q"))
+        q = log.get("actual_q", "target_q")
         time = log.get("timestamp")
         if q is None or time is None or len(log) < MIN_ROWS:
             continue

@@ -81,9 +81,9 @@ class Log:
         """Return whether the log carries the column (group)."""
         return name in self.columns
 
-    def get(self, name: str) -> Array | None:
-        """Return a column (group), or None where the log lacks it."""
-        return self.columns.get(name)
+    def get(self, *names: str) -> Array | None:
+        """Return the first of these columns (groups) that the log has, or None."""
+        return next((self.columns[name] for name in names if name in self.columns), None)
 
     def require(self, *names: str) -> Array:
         """Return the first of these columns that the log has, all of its cells finite.
@@ -166,10 +166,8 @@ class Log:
         """
         if self.has("approach"):
             return np.sign(self.require("approach"))
-        q = self.columns.get("actual_q", self.columns.get("target_q"))
-        if q is None:
-            return None
-        return last_motion(q)
+        q = self.get("actual_q", "target_q")
+        return None if q is None else last_motion(q)
 
     def same_rows(self, other: Log) -> bool:
         """Return whether both logs hold the same columns with the same numbers: a copy."""

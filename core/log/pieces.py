@@ -95,7 +95,7 @@ class _Motion:
 
     def carried(self, piece: Log) -> Log:
         """Return the piece with its column ``approach``, where the log itself lacks one."""
-        q = piece.columns.get("actual_q", piece.columns.get("target_q"))
+        q = piece.get("actual_q", "target_q")
         if piece.has("approach") or q is None:
             return piece
         if self._q is None or self._sign is None:

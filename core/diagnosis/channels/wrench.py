@@ -44,7 +44,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     """
     measured = log.get("ft_raw_wrench")
     needs = [] if measured is not None else ["ft_raw_wrench"]
-    joints = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
+    joints = log.get("actual_q", "target_q")
     if joints is None:
         needs.append("actual_q")
     if measured is None or joints is None:

@@ -39,7 +39,7 @@ SENSORS = {
 
 def sign_findings(model: Model, log: Log) -> list[LogFinding]:
     """Return findings on forces that look reversed or in other axes."""
-    q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
+    q = log.get("actual_q", "target_q")
     if q is None:
         return []
     findings = [LogFinding(LogCheck.TORQUE_UNSIGNED)] if _is_unsigned(log, q) else []

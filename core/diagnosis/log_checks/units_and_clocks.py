@@ -261,12 +261,8 @@ def _gaps(log: Log) -> list[LogFinding]:
     return findings
 
 
-def _angles(log: Log) -> Array | None:
-    return log.get("actual_q") if log.has("actual_q") else log.get("target_q")
-
-
 def _limits(model: Model, log: Log) -> list[LogFinding]:
-    q = _angles(log)
+    q = log.get("actual_q", "target_q")
     if q is None or not np.isfinite(q).any():
         return []
     limits = model.arm.limits
@@ -277,7 +273,7 @@ def _limits(model: Model, log: Log) -> list[LogFinding]:
 
 
 def _poses(log: Log) -> list[LogFinding]:
-    q = _angles(log)
+    q = log.get("actual_q", "target_q")
     if q is None or not np.isfinite(q).all():
         return []
     few, rows = q[:0], 0

@@ -10,8 +10,7 @@ import pytest
 
 from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_rows
-from gapbridge.core.diagnosis.log_checks.frames import frame_findings
-from gapbridge.core.diagnosis.log_checks.kinematics import dh_rows
+from gapbridge.core.diagnosis.log_checks.frames import dh_rows, frame_findings
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
