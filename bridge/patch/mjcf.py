@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from gapbridge.bridge.document.numbers import percent
 from gapbridge.bridge.patch.changes import TOLERANCE, ModelChanges, base_in_world
 from gapbridge.bridge.patch.mjcf_scene import Hinge, Scene
 from gapbridge.bridge.patch.model_format import (
@@ -31,6 +32,7 @@ from gapbridge.core.rotation import rotation_matrix, transform
 PLAY_DECELERATION = 0.2  # rad/s2: up to this deceleration friction holds the play taken up
 GAUSS = (0.5 - 3**0.5 / 6, 0.5 + 3**0.5 / 6)  # of a length: two points of quadrature
 MOMENT_RANGE = 1.5  # times a joint's typical moment: range over which a stiffening spring is fitted
+TOLERATED = 0.06  # share of the largest angle by which such a spring may be off unreported
 LINEAR = 1  # an actuator's interp: linear interpolation
 POINT_INERTIA = 1e-6  # kg m2 of a point mass: MuJoCo requires more than zero
 
@@ -79,11 +81,14 @@ class Mjcf(ModelFormat):
         return Patched(scene.text(comment, options.folder), tuple(model.changed), tuple(missing))
 
 
-def _stiffening(c: float, softening: float, moment_limit: float) -> tuple[float, float, float]:
-    """Return a spring's polynomial for theta = c M / sqrt(1 + softening M^2).
+def _stiffening(
+    c: float, softening: float, moment_limit: float
+) -> tuple[tuple[float, float, float], float]:
+    """Return a spring's polynomial for theta = c M / sqrt(1 + softening M^2), and its error.
 
     The law's inverse is an infinite series of odd powers; MuJoCo's spring has linear and cubic
-    terms, whose factors minimise the squared error of the angle up to ``moment_limit`` Nm.
+    terms, whose factors minimise the squared error of the angle up to ``moment_limit`` Nm. The
+    error is the largest one of the angle there, as a share of the largest angle.
     """
     moment = np.linspace(0.0, moment_limit, 200)[1:]
     root = np.sqrt(1 + softening * moment**2)
@@ -91,7 +96,14 @@ def _stiffening(c: float, softening: float, moment_limit: float) -> tuple[float,
     columns = np.column_stack([angle, angle**3]) * slope[:, None]
     scale = np.linalg.norm(columns, axis=0)
     linear, cubic = np.linalg.lstsq(columns / scale, moment * slope, rcond=None)[0] / scale
-    return float(linear), 0.0, float(cubic)
+    if linear <= 0 or cubic <= 0:  # the spring would push: the series' first terms instead
+        linear, cubic = 1 / c, softening / (2 * c**3)
+    found = np.minimum(moment / linear, np.cbrt(moment / cubic))  # above the root, as Newton needs
+    for _ in range(50):
+        error = linear * found + cubic * found**3 - moment
+        found -= error / (linear + 3 * cubic * found**2)
+    share = float(np.abs(found - angle).max() / angle.max())
+    return (float(linear), 0.0, float(cubic)), share
 
 
 def _named(body: Any) -> str:
@@ -210,9 +222,13 @@ class _Patch:
                 continue
             stiffness: tuple[float, ...] = (1 / c,)
             if k == 2 and softening > 0:
-                stiffness = _stiffening(
-                    c, softening, MOMENT_RANGE * typical_moment(self.changes.model.arm)
-                )
+                limit = MOMENT_RANGE * typical_moment(self.changes.model.arm)
+                stiffness, error = _stiffening(c, softening, limit)
+                if error > TOLERATED:
+                    self.missing.append(
+                        f"stiffening of {name}: up to {limit:.3g} Nm its cubic spring is up to "
+                        f"{percent(error)} of the largest angle off"
+                    )
             inertia = self.scene.inertia_about(name, axes[:, k], origin)
             self._add_hinge(name, label, origin, axes[:, k], stiffness=stiffness, inertia=inertia)
             self.changed.append(f"joint {name}_{label}: stiffness {1 / c:.6g} Nm/rad")

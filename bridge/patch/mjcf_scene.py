@@ -341,7 +341,13 @@ class Scene:
     def text(self, comment: Sequence[str], folder: Path | None) -> str:
         """Return the changed model as XML, its paths relative to ``folder``."""
         self.spec.comment = ""
-        patched = self.spec.compile()
+        try:
+            patched = self.spec.compile()
+        except ValueError as error:  # such as of a link that an effect leaves without mass
+            reason = " ".join(str(error).split())
+            raise InputError(
+                f"{self.path}: with the cell's effects the model does not compile ({reason})"
+            ) from None
         root = ElementTree.fromstring(self.spec.to_xml())
         timestep = float(self.spec.option.timestep)
         text = "\n".join(comment).replace("--", "- -")

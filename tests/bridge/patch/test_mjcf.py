@@ -181,6 +181,12 @@ def test_a_link_is_all_bodies_that_are_fixed_to_it(tmp_path: Path, own: bool) ->
     assert not found.unsupported
 
 
+def test_a_link_that_an_effect_leaves_without_mass_is_one_line(tmp_path: Path) -> None:
+    model = NOMINAL.with_terms([Term("link_inertia", Site(3), (-1.0,))])
+    with pytest.raises(InputError, match=r"^[^\n]*effects the model does not compile [^\n]*link_3"):
+        patched(tmp_path / "arm.xml", mjcf(ARM, UR_JOINTS), model, PatchOptions())
+
+
 def test_a_link_without_mass_is_listed(tmp_path: Path) -> None:
     """MuJoCo takes such a link only if something is fixed to it, as here the load."""
     model = NOMINAL.with_terms([Term("link_inertia", Site(6), (0.25,))])

@@ -21,6 +21,7 @@ from benchmarks.patch.arms import (
 from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
 from gapbridge.core.arm import arm_from_dh, builtin_arm
 from gapbridge.core.effects import Site, Term
+from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
 
@@ -223,6 +224,28 @@ def test_a_joint_that_has_friction_has_the_cells_instead_or_both_where_it_was_si
     assert np.ravel(compiled.dof_damping[dof])[0] == pytest.approx(5.0 + own[1])
     assert compiled.dof_armature[dof] == pytest.approx(0.4 + own[2])
     assert f'<dynamics friction="{3 + own[0]:g}" damping="{5 + own[1]:g}"/>' in text
+
+
+@pytest.mark.parametrize(("share", "off"), [(1.0, None), (0.5, "20 %"), (0.3, "40 %")])
+def test_a_spring_that_cannot_stiffen_as_early_is_listed_with_its_error(
+    tmp_path: Path, share: float, off: str | None
+) -> None:
+    softening = 1 / (share * typical_moment(ARM)) ** 2
+    model = NOMINAL.with_terms([Term("stiffness_nonlinearity", Site(2), (4e-5, softening))])
+    _, _, missing = patched(tmp_path / "a.xml", mjcf(ARM, UR_JOINTS), model, "tcp")
+    assert [line for line in missing if "stiffening of shoulder_lift_joint" in line] == (
+        [] if off is None else missing
+    )
+    assert off is None or f"{off} of the largest angle" in missing[0]
+
+
+def test_a_spring_of_a_joint_that_hardly_bends_at_all_still_pulls(tmp_path: Path) -> None:
+    """Least squares over a range far beyond M0 gave a negative stiffness, and a damping of nan."""
+    model = NOMINAL.with_terms([Term("stiffness_nonlinearity", Site(2), (1.0, 1.0))])
+    text, _, _ = patched(tmp_path / "a.xml", mjcf(ARM, UR_JOINTS), model, "tcp")
+    spring = mujoco.MjSpec.from_string(text).joint("shoulder_lift_joint_axial_compliance")
+    assert spring.stiffness[0] > 0
+    assert np.isfinite(spring.damping).all()
 
 
 def test_a_delayed_actuator_moves_later(tmp_path: Path) -> None:
