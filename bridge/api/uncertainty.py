@@ -12,8 +12,12 @@ from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.document.diagnosis_json import parameter_entries
 from gapbridge.bridge.document.provenance import fitted, intervals_of
 from gapbridge.core.calibration.spread import Spread
+from gapbridge.core.diagnosis.channel_diagnosis import (
+    model_terms,
+    terms_with_stand_ins,
+    with_causes,
+)
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
-from gapbridge.core.diagnosis.model_terms import model_terms, terms_with_stand_ins, with_causes
 from gapbridge.core.effects import CATALOGUE, flexibility_names
 from gapbridge.core.estimation.identification import Identification
 from gapbridge.core.log.log import Log

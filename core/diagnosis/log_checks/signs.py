@@ -189,7 +189,7 @@ def _sensor_axes(model: Model, log: Log, q: Array) -> list[LogFinding]:
     Right-handed axes are a misalignment, which the diagnosis measures.
     """
     wrench, pull = log.get("ft_raw_wrench"), log.get("actual_TCP_force")
-    rows = _rows(q, wrench, pull)
+    rows = checked_rows(q, wrench, pull)
     if wrench is None or len(rows) < MIN_ROWS:
         return []
     read = wrench[rows]
