@@ -110,6 +110,9 @@ def _session(section: CalibrationSettings, arm: Arm, arm_reach: float) -> Iterat
                 sure=bool(np.isfinite(arm.payload)),
             )  # fmt: skip
         yield from _payload(keys, load, arm, arm_reach)
+    if (sigma := section.instrument.sigma or 0.0) > SIGMA_WARNING:
+        where = (top, "instrument", "sigma")
+        yield Implausible(where, f"{sigma:g} m", "less than 0.001 m", sure=False)
     if section.accuracy is not None and section.accuracy >= SIGMA_ERROR:
         yield Implausible((top, "accuracy"), f"{section.accuracy:g}", "m (it looks like mm)")
     places: list[tuple[tuple[str | int, ...], Sequence[float]]] = [
@@ -122,9 +125,9 @@ def _session(section: CalibrationSettings, arm: Arm, arm_reach: float) -> Iterat
         places += [((*keys, "lower"), box.lower), ((*keys, "upper"), box.upper)]
         if np.any(np.array(box.lower) >= box.upper):
             yield Implausible((*keys, "lower"), f"{box.lower}", f"less than upper, {box.upper}")
-    for where, xyz in places:
+    for at, xyz in places:
         if (size := max(map(abs, xyz), default=0.0)) > MAX_DISTANCE:
-            yield Implausible(where, f"{size:g}", "m (it looks like mm)")
+            yield Implausible(at, f"{size:g}", "m (it looks like mm)")
     for end in ("lower", "upper") if section.joint_range is not None else ():
         if (angle := max(map(abs, getattr(section.joint_range, end)), default=0.0)) > MAX_LIMIT:
             yield Implausible(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -141,7 +141,7 @@ class CalibrationJob(Job):
         fit = run_fit(self.cell, options, prompt, self.session)
         fit, rejected = self._with_missing_effects(fit)
         result = evaluate_session(self.cell, options, prompt, self.session, fit, rejected)
-        report_calibration(prompt, result)
+        report_calibration(prompt, result, [r.stop for r in self.session.accepted])
         metrology = metrology_of(self.cell, options.instrument, self.session.station_count)
         write_log(result.readings, metrology.registered, folder / "readings.csv")
         origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
@@ -235,8 +235,11 @@ def evaluate_session(
         )  # fmt: skip
 
 
-def report_calibration(prompt: Prompt, result: Calibration) -> None:
-    """Print the result of a fit: errors, noise, parameters, what is not identifiable."""
+def report_calibration(prompt: Prompt, result: Calibration, stops: Sequence[int]) -> None:
+    """Print the result of a fit: errors, noise, parameters, what is not identifiable.
+
+    ``stops`` (N,) are those of the readings, from 0.
+    """
     prompt.say(calibration_text(result), "bold green" if result.complete else "bold yellow")
     pairs = (
         ("fitted poses", result.before, result.after),
@@ -255,7 +258,7 @@ def report_calibration(prompt: Prompt, result: Calibration) -> None:
     prompt.say(noise)
     prompt.console.print(_table(result))
     for row in result.outliers:
-        prompt.say(f"  outlier, down-weighted: reading {int(row) + 1}")
+        prompt.say(f"  outlier, down-weighted: reading {int(row) + 1}, of stop {stops[row] + 1}")
     for note in result.notes:
         prompt.say(f"  note: {note_text(note)}")
     if result.combinations:

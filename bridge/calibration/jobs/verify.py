@@ -151,6 +151,10 @@ class VerifyJob(Job):
             f"{millimetres(verification.errors.max)} at most; {verification.ratio:.2f} times what "
             "was predicted"
         )
+        moved = verification.moved
+        if moved is not None and moved.reading is not None:
+            stop = self.session.accepted[moved.reading - 1].stop + 1
+            prompt.say(f"  reading {moved.reading} is of stop {stop}")
         for estimate in () if verification.moved is None else verification.moved.estimates:
             prompt.say(
                 f"  {estimate.name} {quantity_text(estimate.value, estimate.unit)} "

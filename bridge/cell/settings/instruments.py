@@ -22,7 +22,7 @@ class Base(Section):
     """The settings that all instruments share."""
 
     reads: ClassVar[str] = "position"  # kind of its readings if it measures no pose
-    sigma: Positive | None = Field(
+    sigma: Annotated[Positive, Field(lt=0.01)] | None = Field(  # in mm it would pass everything
         default=None, description="m, 1 sigma of one coordinate; default: metrology.sigma"
     )
     serial: str = Field(default="", description="of the instrument, for the report")
@@ -139,7 +139,7 @@ class SphereSettings(Base):
 
     reads = "sphere"
     kind: Literal["sphere"]
-    radius: Positive | None = Field(
+    radius: Annotated[Positive, Field(lt=1.0)] | None = Field(
         default=None, description="m, of sphere and probe together; default: estimated"
     )
 

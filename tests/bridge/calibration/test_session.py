@@ -316,6 +316,24 @@ def test_a_verification_does_not_pass_by_the_readings_of_the_one_before(
     assert "found no new row for 0.2 s, expected stop 1" in resumed.out
 
 
+def test_an_outlier_is_told_with_its_stop(
+    clean: tuple[Path, CommandResult], tmp_path: Path
+) -> None:
+    entries = [e for e in read_entries(clean[0] / "s" / FILE) if e["kind"] != "ended"]
+    fitted = [p.number for p in plan_in(clean[0] / "s").poses if not p.held_out and not p.repeat]
+    readings = {e["stop"]: e for e in entries if e["kind"] == "reading"}
+    first, last = (i for i in fitted if i in (min(fitted), max(fitted)))
+    readings[last]["value"][1] += 4e-3
+    index = entries.index(readings[first])
+    entries[index] = {"kind": "skip", "time": readings[first]["time"], "stop": first}
+    (tmp_path / "s").mkdir()
+    lines = "".join(json.dumps(e) + "\n" for e in entries)
+    (tmp_path / "s" / FILE).write_text(lines, encoding="utf-8")
+    cell = clean[0] / "cell.yaml"
+    result = run_calibrate(cell, "--session", tmp_path / "s", lines=["no", "no"])
+    assert f"outlier, down-weighted: reading {last}, of stop {last + 1}" in result.out, result.err
+
+
 def test_a_missed_accuracy_is_told_before_the_cell_is_written(
     clean: tuple[Path, CommandResult], tmp_path: Path
 ) -> None:

@@ -192,6 +192,11 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
         ),
         (ARM + "metrology: {registered: 1}", "found 1", "true or false"),
         (ARM + "metrology: {sigma: -1}", "found -1", "0 or more"),
+        (
+            ARM + "calibration: {instrument: {kind: typed, unit: mm, sigma: 0.02}}",
+            "found 0.02", "less than 0.01 (m",
+        ),
+        (ARM + "calibration: {instrument: {kind: sphere, radius: 30}}", "found 30", "than 1 (m"),
         (ARM + "link: {host: '10.0.0.2:30004'}", "'10.0.0.2:30004'", "without a port"),
         (ARM + "link: {host: 192.168.0..10}", "link.host: found '192.168.0..10'", "its labels"),
         (

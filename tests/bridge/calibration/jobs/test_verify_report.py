@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from gapbridge.bridge.calibration.jobs.verify import VerifyJob
@@ -23,14 +25,16 @@ def suspect(joint: int, value: float) -> CandidateChange:
     return CandidateChange(name, found, 0.4, 30.0, effect="joint_offset", joint=joint)
 
 
-def said(*others: CandidateChange) -> list[str]:
+def said(*others: CandidateChange, moved: CandidateChange | None = None) -> list[str]:
     found = Verification(
         holds=False, errors=Errors(np.full((5, 3), 1e-3), np.arange(5)),
         predicted=np.full(5, 1e-4), ratio=9.0,
-        chance=1e-9, moved=suspect(4, 0.01), alternatives=others, stations=(), notes=(),
+        chance=1e-9, moved=moved or suspect(4, 0.01), alternatives=others, stations=(), notes=(),
     )  # fmt: skip
     job = VerifyJob.__new__(VerifyJob)
     job.prompt = prompt = Lines()  # type: ignore[assignment]
+    stops = [SimpleNamespace(stop=i) for i in (0, 4)]
+    job.session = SimpleNamespace(accepted=stops)  # type: ignore[assignment]
     job._report(found)
     return prompt.lines
 
@@ -39,6 +43,11 @@ def test_other_joints_that_explain_as_much_are_named_with_their_size() -> None:
     lines = said(suspect(3, -0.02))
     (line,) = [line for line in lines if "cannot distinguish" in line]
     assert "the zero of joint 3 moved by 20 mrad" in line
+
+
+def test_a_reading_that_does_not_fit_is_told_with_its_stop() -> None:
+    lines = said(moved=CandidateChange("reading_2", (), 0.4, 30.0, reading=2))
+    assert "  reading 2 is of stop 5" in lines
 
 
 def test_no_alternative_is_named_if_the_readings_decide() -> None:
