@@ -374,4 +374,8 @@ def grouped(
         columns[name] = np.empty((rows, expected))
         for k in range(expected):
             columns[name][:, k] = column(indices[k])
+    place = columns.get("measured_position", np.ones((1, 3)))
+    nowhere = ~place.any(axis=1)
+    if nowhere.sum() > 1:  # instruments give zeros without a target; the first may be the origin
+        place[nowhere] = np.nan
     return columns

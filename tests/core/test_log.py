@@ -47,6 +47,20 @@ def test_what_is_written_is_read(tmp_path):
     assert log.get("target_q") is None
 
 
+@pytest.mark.parametrize(("zeros", "missing"), [((1, 4), [1, 4]), ((0,), [])])
+def test_positions_of_three_zeros_are_missing_readings(tmp_path, zeros, missing):
+    """A fifth of such rows were links 4 mm off, with certainty; one may be the frame's origin."""
+    position = np.arange(18.0).reshape(6, 3) + 1
+    position[5, 1:] = 0.0
+    position[list(zeros)] = 0.0
+    rows = np.hstack([joints(6), position]).tolist()
+    names = [*JOINTS, *(f"measured_position_{k}" for k in range(3))]
+    log = read_log(write(tmp_path, table(names, rows)), 6)
+    found = np.isnan(log.columns["measured_position"])
+    np.testing.assert_array_equal(np.flatnonzero(found.any(axis=1)), missing)
+    np.testing.assert_array_equal(found.any(axis=1), found.all(axis=1))
+
+
 @pytest.mark.parametrize("delimiter", [",", ";"])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 @pytest.mark.parametrize("mark", ["", "\ufeff"])
