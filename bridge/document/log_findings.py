@@ -72,6 +72,8 @@ TEXTS = {
     "as sorted by name)",
     LogCheck.JOINTS_REVERSED: "the joints seem to be in reverse order",
     LogCheck.JOINT_ORDER: "the joints look out of order: {0:order}",
+    LogCheck.COMMAND_ORDER: "target_q does not follow actual_q: its joints look out of order: "
+    "{0:order}",
     LogCheck.PULL_SIGN: PULL.format("to have the wrong sign"),
     LogCheck.PULL_IN_TOOL: PULL.format("to be in tool axes"),
     LogCheck.PULL_SIGN_IN_TOOL: PULL.format("to have the wrong sign and to be in tool axes"),

@@ -54,6 +54,7 @@ class LogCheck(Enum):
     UR_JOINTS_SWAPPED = auto()  # elbow and shoulder pan, as sorted by name: two joints
     JOINTS_REVERSED = auto()
     JOINT_ORDER = auto()  # (joint, index of its column) of those out of place
+    COMMAND_ORDER = auto()  # the same of target_q
     # forces
     PULL_SIGN = auto()
     PULL_IN_TOOL = auto()
@@ -79,6 +80,7 @@ MISREAD = {
     LogCheck.WRENCH_SIGN: "wrench", LogCheck.TORQUES_FIRST: "wrench",
     LogCheck.LEFT_HANDED_WRENCH: "wrench", LogCheck.TORQUE_SIGN: "torque",
     LogCheck.TORQUE_UNSIGNED: "torque", LogCheck.CURRENTS: "torque",
+    LogCheck.COMMAND_ORDER: "tracking",
 }  # fmt: skip
 """Channels whose readings are not what their column should hold."""
 

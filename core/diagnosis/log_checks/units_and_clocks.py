@@ -184,11 +184,12 @@ def findings(
     if model is None:
         return listed
     # imported here, because prediction only checks units
+    from gapbridge.core.diagnosis.log_checks.commands import command_findings
     from gapbridge.core.diagnosis.log_checks.frames import frame_findings
     from gapbridge.core.diagnosis.log_checks.signs import sign_findings
     from gapbridge.core.diagnosis.log_checks.weights import weight_findings
 
-    listed += [*_limits(model, log), *_poses(log)]
+    listed += [*_limits(model, log), *_poses(log), *command_findings(log)]
     if not at_rest:
         listed += frame_findings(model, log, metrology or Metrology())
     weights = weight_findings(model, log)

@@ -284,6 +284,28 @@ def test_a_sensor_or_a_pull_of_the_wrong_sign_is_suspected(moving, turned):
         assert line.startswith(f"{turned} seems to have the wrong sign;")
 
 
+@pytest.mark.parametrize(
+    ("order", "told"),
+    [([2, 1, 0], "joint 1 is column _2, joint 3 is column _0"),
+     ([1, 2, 0], "joint 1 is column _2, joint 2 is column _0, joint 3 is column _1"),
+     ([0, 1, 2], "")],
+)  # fmt: skip
+def test_commands_in_another_order_of_joints_are_reported(order, told):
+    log = with_columns(target_q=(SESSION.q + 0.02)[:, order])
+    lines = [line for line in findings(log, MODEL, REGISTERED) if "target_q" in line]
+    assert lines == ([f"target_q does not follow actual_q: its joints look out of order: {told}"]
+                     if told else [])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "command", [0.0, SESSION.q[:1], 1.6 * SESSION.q], ids=("zeros", "frozen", "droop")
+)
+def test_commands_that_are_far_off_are_in_no_other_order(command):
+    """Zeros, a frozen command, and servos that give way (a hobby arm reached 62 %)."""
+    log = with_columns(target_q=command + 0 * SESSION.q)
+    assert not [line for line in findings(log, MODEL, REGISTERED) if "target_q" in line]
+
+
 AXES = {
     "those along y, x and z": ([1, 0, 2], [1, 1, 1]),
     "those along -x, y and z": ([0, 1, 2], [-1, 1, 1]),
