@@ -17,6 +17,7 @@ from gapbridge.bridge.document.numbers import percent
 from gapbridge.bridge.patch.changes import TOLERANCE, ModelChanges, base_in_world
 from gapbridge.bridge.patch.mjcf_scene import Hinge, Scene
 from gapbridge.bridge.patch.model_format import (
+    MARK,
     ModelFormat,
     Patched,
     PatchOptions,
@@ -76,7 +77,7 @@ class Mjcf(ModelFormat):
                 "are, qpos has the further joints in it"
             )
         missing = model.unsupported()
-        comment = ["Patched by gapbridge.", *model.changed, *notes,
+        comment = [MARK, *model.changed, *notes,
                    *(f"not in here: {line}" for line in missing)]  # fmt: skip
         return Patched(scene.text(comment, options.folder), tuple(model.changed), tuple(missing))
 

@@ -260,6 +260,7 @@ class Scene:
 
     def add_hinge_after(self, joint: str, hinge: Hinge) -> None:
         """Add a hinge after a joint and the hinges added there before, in the joint's body."""
+        self._require_new("joint", hinge.name)
         self._after.setdefault(joint, []).append(hinge)
 
     def add_friction_tendon(self, joint: str, added: str, friction: float, softness: float) -> None:
@@ -271,9 +272,20 @@ class Scene:
         in_written = np.linalg.inv(self._written_in_frame(body))  # which the inserted body gets
         turn, shift = in_written[:3, :3], in_written[:3, 3]
         placed = [replace(h, point=turn @ h.point + shift, axis=turn @ h.axis) for h in hinges]
+        for hinge in hinges:
+            self._require_new("joint", hinge.name)
         if body.name not in self._before:
+            self._require_new("body", name)
             self._keep_apart(body)
         self._before[body.name] = (name, [*self._before.get(body.name, (name, []))[1], *placed])
+
+    def _require_new(self, kind: str, name: str) -> None:
+        """Raise InputError where the model has a joint or body of a name that is to be added."""
+        if getattr(self.spec, kind)(name) is not None:
+            raise InputError(
+                f"{self.path}: {kind}: found {name!r} already, expected the model without it: that "
+                "is what the patch adds"
+            )
 
     def _keep_apart(self, body: Any) -> None:
         """Exclude the contacts that MuJoCo itself leaves out while a body is its parent's child."""

@@ -13,6 +13,8 @@ from gapbridge.bridge.patch.changes import ModelChanges
 from gapbridge.core.errors import InputError
 from gapbridge.core.log.sources.joint_order import order_joints
 
+MARK = "Patched by gapbridge."  # first line of a patched model's comment
+
 
 @dataclass(frozen=True)
 class PatchOptions:
@@ -56,6 +58,15 @@ class ModelFormat(ABC):
         Raises InputError where the model cannot be read, is of another arm, or its joints cannot
         be assigned to the arm's.
         """
+
+
+def require_original(path: Path, options: PatchOptions) -> None:
+    """Raise InputError for a model that was patched already, unless the cell adds to it."""
+    if not options.on_top and MARK.encode() in path.read_bytes():
+        raise InputError(
+            f"{path}: found a model that was patched already, expected the original one: what the "
+            "cell holds would be in it twice (a cell diagnosed with --sim may add to it)"
+        )
 
 
 def pick_joints(

@@ -12,6 +12,7 @@ import numpy as np
 
 from gapbridge.bridge.patch.changes import TOLERANCE, Axes, ModelChanges, base_in_world
 from gapbridge.bridge.patch.model_format import (
+    MARK,
     ModelFormat,
     Patched,
     PatchOptions,
@@ -63,7 +64,7 @@ class Urdf(ModelFormat):
         missing = [*without_mass, *_tool(document, path, changes, options, world, frames, changed),
                    *_springs(changes), *_settings(changes)]  # fmt: skip
         document.rebase(options.folder or path.parent)
-        document.comment(["Patched by gapbridge.", *changed, *notes,
+        document.comment([MARK, *changed, *notes,
                           *(f"not in this file: {line}" for line in missing)])  # fmt: skip
         return Patched(document.text, tuple(changed), tuple(missing))
 

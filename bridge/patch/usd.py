@@ -15,6 +15,7 @@ import numpy as np
 
 from gapbridge.bridge.patch.changes import TOLERANCE, ModelChanges, base_in_world
 from gapbridge.bridge.patch.model_format import (
+    MARK,
     ModelFormat,
     Patched,
     PatchOptions,
@@ -62,7 +63,7 @@ class Usd(ModelFormat):
         layer.tool()
         layer.gravity()
         missing = layer.unsupported()
-        comment = ["Patched by gapbridge.", *layer.changed, *notes,
+        comment = [MARK, *layer.changed, *notes,
                    *(f"not in this file: {line}" for line in missing)]  # fmt: skip
         return Patched(stage.text(comment), tuple(layer.changed), tuple(missing))
 

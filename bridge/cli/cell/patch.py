@@ -11,7 +11,7 @@ from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.schema import CauseEntry
 from gapbridge.bridge.cli.options import FILE, cell_option, open_cell
 from gapbridge.bridge.document.output_file import require_suffix, require_writable, write_text
-from gapbridge.bridge.patch.model_format import PatchOptions
+from gapbridge.bridge.patch.model_format import PatchOptions, require_original
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.errors import InputError
 
@@ -66,6 +66,7 @@ def patch(
     opened = open_cell(cell)
     require_suffix(require_writable(out, model, cell), kind.text_suffixes)
     options = _options(opened, out, joints, tcp, load)
+    require_original(model, options)
     bounds = None
     if parameters is not None:
         bounds = _bounds(model, opened, options, parameters, (out, cell))

@@ -66,6 +66,25 @@ def test_a_tie_is_a_comment_with_both_candidates(folder: Path, model: str) -> No
     assert done.out.count("tie:") == 2
 
 
+@pytest.mark.parametrize("model", ["arm.xml", "arm.urdf"])
+def test_a_patched_model_is_patched_again_only_by_a_cell_that_adds_to_it(
+    folder: Path, model: str
+) -> None:
+    once, twice = (f"{name}{Path(model).suffix}" for name in ("once", "twice"))
+    (cell := folder / "cell.yaml").write_text(CELL.replace("{value: 0.004}", "{value: 0.0004}"))
+    assert patch(folder, model, "--out", once).code == 0
+    done = patch(folder, once, "--out", twice)
+    assert done.code == 2
+    assert f"{once}: found a model that was patched already, expected the original" in done.err
+    cell.write_text(cell.read_text() + "  files: [{role: sim, name: simulated.csv}]\n")
+    done = patch(folder, once, "--out", twice)
+    if model.endswith("xml"):  # its springs have the names of those that would be added
+        assert done.code == 2
+        assert "joint: found 'shoulder_lift_joint_axial_compliance' already" in done.err
+    else:
+        assert done.code == 0, done.err
+
+
 def test_names_that_are_not_utf8_are_escaped_or_refused(folder: Path) -> None:
     cell, model = (folder / os.fsdecode(name) for name in (b"c\xff.yaml", b"m\xff.xml"))
     (folder / "cell.yaml").rename(cell)
