@@ -150,9 +150,9 @@ class _Document:
         ``inside``: the child element that contains <tag>; '': <tag> is a direct child.
         """
         with_type = r"(?=[^>]*\btype\s*=)" if kind == "joint" else ""  # no transmission's joint
-        visible = _without_comments(self.text)
+        visible, written_name = _without_comments(self.text), re.escape(escape(name))
         block = re.search(
-            rf"<{kind}\b{with_type}[^>]*\bname\s*=\s*([\"']){re.escape(name)}\1[^>]*>.*?</{kind}>",
+            rf"<{kind}\b{with_type}[^>]*\bname\s*=\s*([\"']){written_name}\1[^>]*>.*?</{kind}>",
             visible, re.DOTALL,
         )  # fmt: skip
         assert block is not None, f"{kind} {name}"

@@ -63,3 +63,16 @@ def test_meshes_beside_a_urdf_are_found_from_another_folder(tmp_path: Path) -> N
     found = [mesh.get("filename") for mesh in ElementTree.fromstring(text).iter("mesh")]
     assert found == ["../model/meshes/a & b.stl", *names[1:]]
     assert visuals in text  # the comment
+
+
+def test_names_with_an_ampersand_are_found(tmp_path: Path) -> None:
+    given = urdf(ARM, UR_JOINTS).replace(UR_JOINTS[2], "elbow &amp; forearm")
+    path = tmp_path / "a.urdf"
+    path.write_text(given.replace("link_3", "link &lt;3&gt;"), encoding="utf-8")
+    joints = tuple(name if i != 2 else "elbow & forearm" for i, name in enumerate(UR_JOINTS))
+    changes = changes_of(Model(ARM).with_terms(CHANGES))
+    text = format_of(path).patch(path, changes, PatchOptions(joints=joints), []).text
+    before, after = (ElementTree.fromstring(t) for t in (path.read_text("utf-8"), text))
+    masses = [[float(m.get("value", "")) for m in t.iter("mass")] for t in (before, after)]
+    ratios = [new / old for old, new in zip(*masses, strict=True)]
+    assert [round(ratio, 6) for ratio in ratios] == [1, 1, 1.1, 1, 1, 1]
