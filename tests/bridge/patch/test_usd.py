@@ -17,7 +17,7 @@ from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
 
 pxr = pytest.importorskip("pxr")
-from pxr import Gf, Usd, UsdGeom, UsdPhysics  # noqa: E402
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics  # noqa: E402
 
 ARM = builtin_arm("ur10e")
 TOOL = np.eye(4)
@@ -353,3 +353,24 @@ def test_links_that_touch_at_a_flexible_joint_still_do_not_collide(
     pairs = UsdPhysics.FilteredPairsAPI(stage.GetPrimAtPath("/arm/link_3"))
     filtered = [str(path) for path in pairs.GetFilteredPairsRel().GetTargets()]
     assert filtered == ([] if touching else ["/arm/link_2"])
+
+
+@pytest.mark.parametrize("on_top", [False, True])
+def test_a_joint_that_has_friction_has_the_cells_instead_or_both_where_it_was_simulated(
+    tmp_path: Path, on_top: bool
+) -> None:
+    write_stage(tmp_path / "a.usda", ARM, 1.0, nested=False)
+    given = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    joint = given.GetPrimAtPath(f"/arm/{UR_JOINTS[0]}")
+    joint.CreateAttribute("newton:friction", Sdf.ValueTypeNames.Float).Set(10.0)
+    given.Save()
+    found = format_of(tmp_path / "a.usda").patch(
+        tmp_path / "a.usda",
+        changes_of(NOMINAL.with_terms([Term("coulomb_friction", Site(1), (3.0,))])),
+        PatchOptions(folder=tmp_path, on_top=on_top),
+        [],
+    )
+    (tmp_path / "b.usda").write_text(found.text)
+    stage = Usd.Stage.Open(str(tmp_path / "b.usda"))
+    friction = stage.GetPrimAtPath(f"/arm/{UR_JOINTS[0]}").GetAttribute("newton:friction").Get()
+    assert friction == pytest.approx(13.0 if on_top else 3.0)
