@@ -195,6 +195,8 @@ def _report_resumed(prompt: Prompt, session: Session, folder: Path) -> None:
         prompt.say("  the last line of its journal was incomplete and is ignored")
     if session.accepted:
         prompt.say(f"  the last reading kept: stop {session.accepted[-1].stop + 1}")
+        if session.next_stop is not None:
+            prompt.say("  if the instrument was moved since, type `moved`; `back` finds out")
     if session.mounted is not None and session.plan is not None and session.next_stop is not None:
         prompt.say(f"  on the flange: {load_text(session.plan.loads[session.mounted])}")
 

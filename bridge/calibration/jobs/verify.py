@@ -24,7 +24,7 @@ from gapbridge.bridge.calibration.planning import (
     workspace_of,
 )
 from gapbridge.bridge.calibration.session.session import seconds_left
-from gapbridge.bridge.cell.verification_mark import mark_path, remove_mark, write_mark
+from gapbridge.bridge.cell.verification_mark import mark_path, read_mark, remove_mark, write_mark
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.accuracy_baseline import AccuracyBaseline, read_baseline
@@ -140,6 +140,14 @@ class VerifyJob(Job):
                 f"{mark}: written; `gapbridge run {path}` does not arm until a "
                 f"verification passes, or a person has acknowledged it: gapbridge disarm {path}"
             )
+        elif (
+            verification.holds and self.cell.metrology.registered and self.session.station_count > 1
+        ):
+            if read_mark(path):  # it may be of joint 1, which shows from a registered place only
+                prompt.warn(
+                    f"{mark_path(path)}: kept: the instrument was moved, so that a turn of the "
+                    "whole arm does not show; verify again from one place"
+                )
         elif verification.holds and remove_mark(path):
             prompt.say(f"{mark_path(path)}: removed")
 

@@ -251,9 +251,13 @@ def test_stops_that_a_later_obstacle_does_not_allow_are_told(tmp_path: Path) -> 
     assert run_calibrate(cell, "--plan-only", "--session", session).code == 0
     resumed = run_calibrate(cell, "--session", session, lines=["quit"])
     assert "not free of them now" not in resumed.out
+    assert "type `moved`" not in resumed.out  # nothing was measured
+    reading = reading_line(tracker_readings(plan_in(session))[0])
+    run_calibrate(cell, "--session", session, lines=["", reading, "quit"])
     cell.write_text(cell.read_text() + "  keep_out: [{lower: [0.3, -2, 0], upper: [2, 2, 2]}]\n")
     resumed = run_calibrate(cell, "--session", session, lines=["quit"])
     assert "not free of them now: stops" in " ".join(resumed.out.split())
+    assert "if the instrument was moved since, type `moved`" in resumed.out
 
 
 def test_a_session_resumes_only_with_its_own_cell(
