@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import SAME_SHARE
 from gapbridge.core.diagnosis.observation import HELD_TORQUE
+from gapbridge.core.diagnosis.selection.candidate import target_of
 from gapbridge.core.diagnosis.selection.sample_space import SampleSpace
 from gapbridge.core.estimation.held_out import random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
@@ -94,16 +95,31 @@ def dependence(
     for c, candidate in enumerate(space.candidates):
         if not candidate.named and candidate.quantity:
             by_size.setdefault(int(space.start[c + 1] - space.start[c]), []).append(c)
-    best: dict[str, float] = {}
+    shares: dict[int, float] = {}
     for size, members in by_size.items():
         for few in np.array_split(members, 1 + len(members) * size // AT_ONCE):
             columns = space.X[:, space.column_indices(few.tolist())]
             clean = projected_out(fitted, columns)
             blocks = clean.reshape(len(r), len(few), size).transpose(1, 0, 2)
-            for c, share in zip(few, _held_out_shares(blocks, r, fold), strict=True):
-                quantity = space.candidates[c].quantity
-                best[quantity] = max(best.get(quantity, -np.inf), float(share))
+            shares |= zip(few.tolist(), _held_out_shares(blocks, r, fold).tolist(), strict=True)
+    constant: dict[str, float] = {}  # by target: the largest share of functions that contain one
+    for c, share in shares.items():
+        k = space.candidates[c]
+        if k.target == target_of(k.quantity, "actual_q", "target_q"):
+            constant[k.target] = max(constant.get(k.target, share), share)
+    best: dict[str, float] = {}
+    for c in sorted(shares):
+        k, share = space.candidates[c], shares[c]
+        # what a constant predicts as well does not depend on time: the first jump is nearly one
+        if k.jumps and not _beyond(constant.setdefault(k.target, share), share):
+            continue
+        best[k.quantity] = max(best.get(k.quantity, -np.inf), share)
     return _one_of_a_kind(_loads_before_time(sorted(best.items(), key=lambda item: -item[1])))
+
+
+def _beyond(constant: float, share: float) -> bool:
+    """Return whether a share is clearly larger than a constant's, or leaves less than half."""
+    return share > constant + min(SAME_SHARE, (1 - constant) / 2)
 
 
 def _loads_before_time(ranked: list[tuple[str, float]]) -> list[tuple[str, float]]:

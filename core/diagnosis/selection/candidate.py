@@ -43,6 +43,7 @@ class Candidate:
     target: str = ""  # the joint, axis or frame that it moves
     requires: str = ""  # family without which it changes no prediction
     whole: tuple[Parameter, ...] = ()  # with those fixed in its columns, bounded; (): as nominal
+    jumps: bool = False  # a smooth candidate: 0 before one time, constant after it
 
     @property
     def named(self) -> bool:

@@ -6,6 +6,8 @@ joint's angle, the measurement in base axes, the tool in flange axes, or the sca
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gapbridge.core.arrays import Array
@@ -128,7 +130,8 @@ def _steps(name: str, z: Array, targets: dict[str, Array]) -> list[CandidateColu
     for quantile in np.linspace(0.06, 0.94, STEPS):
         after = (z > np.quantile(z, quantile)).astype(float)[:, None]
         if 2 <= after.sum() <= len(z) - 2:
-            pairs += [_spread(name, target, d, after) for target, d in targets.items()]
+            steps = (_spread(name, target, d, after) for target, d in targets.items())
+            pairs += [(replace(step, jumps=True), columns) for step, columns in steps]
     return pairs
 
 

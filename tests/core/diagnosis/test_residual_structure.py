@@ -97,6 +97,27 @@ def test_a_function_is_judged_on_conditions_that_it_was_not_fitted_to():
     assert apart["actual_q_0"] > 0.9
 
 
+@pytest.mark.parametrize("target", ["joint_1", "position"])
+@pytest.mark.parametrize(("first", "jumped"), [(0, False), (20, True), (45, True), (75, True)])
+def test_what_was_there_all_the_time_does_not_depend_on_it(target, first, jumped):
+    """A jump near the beginning is nearly a constant."""
+    rng = np.random.default_rng(4)
+    way, angle, row = rng.normal(size=ROWS), rng.normal(size=ROWS), np.arange(ROWS)
+    starts = np.linspace(5, 85, 17)
+    candidates = [
+        toy.smooth("actual_q_0", "joint_1", 2), toy.smooth("timestamp", target),
+        *(replace(toy.smooth("timestamp", target), jumps=True) for _ in starts),
+    ]  # fmt: skip
+    X = np.column_stack([
+        way, way * angle, way * (row - row.mean()) / row.std(),
+        *(way * (row > start) for start in starts),
+    ])  # fmt: skip
+    y = 5 * way * (row >= first) + rng.normal(size=ROWS)
+    shares = dict(dependence(toy.space_of(candidates, y, X), np.zeros((ROWS, 0)), (), GROUPS))
+    assert (shares["timestamp"] > 0.6) == jumped
+    assert jumped or shares["timestamp"] < 0.05
+
+
 def test_joint_temperatures_rise_together_and_are_reported_once():
     names = [n for n, _ in dependence(space(6, (7,)), FRAME, (), GROUPS)]
     assert sum(n.startswith("joint_temperatures_") for n in names) == 1
