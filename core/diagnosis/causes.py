@@ -135,7 +135,8 @@ def _not_identifiable(
     ):  # fmt: skip
         if spread == 0 or spread > UNDETERMINED_SPREAD * parameter.scale:
             name = CATALOGUE[effect].label(term.site, parameter)
-            state = ParameterState.NOMINAL if is_nominal else ParameterState.NOT_IDENTIFIABLE
+            is_far = is_nominal and CATALOGUE[effect].estimated_as_whole
+            state = ParameterState.NOMINAL if is_far else ParameterState.NOT_IDENTIFIABLE
             notes.append(ParameterNote(state, name, value, parameter.unit))
     return notes
 

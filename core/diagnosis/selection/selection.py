@@ -17,6 +17,7 @@ from gapbridge.core.diagnosis.criteria import (
     MIN_SIGMAS,
     MIN_SIGMAS_WITH_UNNAMED,
     PRIOR_REACH,
+    UNDETERMINED_SPREAD,
 )
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.geometry import (
@@ -135,19 +136,26 @@ class Selection:
         return replace(self, prior=sigma)
 
     def implausible_parameters(self, positions: Sequence[int]) -> dict[int, Mask]:
-        """Return, by candidate, link parameters (d,) far outside the prior and not significant.
+        """Return, by candidate, parameters (d,) of positions that are not significant, but large.
 
-        A value several times the machining tolerance of all others has to be as significant as a
-        single cause. Of single links it is the farthest one only, since others may depend on it.
+        A link's value several times the machining tolerance of all others has to be as significant
+        as a single cause. Of single links it is the farthest one only, since others may depend on
+        it. Of other effects it is what is not identifiable: it may be anything. (A tool of a UR10
+        stood 67 mm off along an axis whose standard deviation was 47 mm.)
         """
         implausible, single = {}, {}
         for p in positions:
             c = self.term_index[p]
             usual = _usual_size(self, c)
+            spread = np.sqrt(np.diag(self.covariance[p]))
+            size = np.abs(self.terms[p].values[: len(spread)])  # others are fixed
+            unsure = size < MIN_SIGMAS_WITH_UNNAMED * spread
             if usual is None:
+                # alone, what is not significant is no cause
+                if self.observation.channel == "position" and len(unsure) > 1 and unsure.any():
+                    unsure &= spread > UNDETERMINED_SPREAD * self.space.candidates[c].scales
+                    implausible |= {c: unsure} if unsure.any() else {}
                 continue
-            size = np.abs(self.terms[p].values)
-            unsure = size < MIN_SIGMAS_WITH_UNNAMED * np.sqrt(np.diag(self.covariance[p]))
             times = size / usual
             far = (times > MIN_SIGMAS) & unsure
             if far.any() and c in self.prior:
@@ -161,7 +169,7 @@ class Selection:
         return implausible
 
     def with_nominal(self, numbers: Mapping[int, Mask]) -> Selection:
-        """Return the selection with further link parameters (d,) kept nominal."""
+        """Return the selection with further parameters (d,) kept nominal."""
         return replace(self, nominal=self.nominal | {
             c: own | self.nominal.get(c, False) for c, own in numbers.items()
         })  # fmt: skip
@@ -258,7 +266,9 @@ def refitted_alone(
     for c, term, term_covariance in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)
         if (fixed := selection.nominal.get(c)) is not None:
-            term = term.with_values(np.where(fixed, 0.0, term.values))
+            values = np.array(term.values)
+            values[: len(fixed)][fixed] = 0.0
+            term = term.with_values(values)
             term_covariance = term_covariance * ~(fixed | fixed[:, None])
         terms[position], covariance[position] = term, term_covariance
     return replace(
