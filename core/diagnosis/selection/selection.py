@@ -143,7 +143,8 @@ class Selection:
         it. Of other effects it is what is not identifiable: it may be anything. (A tool of a UR10
         stood 67 mm off along an axis whose standard deviation was 47 mm.)
         """
-        implausible, single = {}, {}
+        implausible: dict[int, Mask] = {}
+        single: dict[int, tuple[Mask, float]] = {}
         for p in positions:
             c = self.term_index[p]
             usual = _usual_size(self, c)
