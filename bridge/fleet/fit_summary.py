@@ -59,7 +59,7 @@ class FittedType:
 
     @property
     def has_size(self) -> Mask:
-        """Return which flexibilities (2n,) exceed their own 1 sigma; of others no share is told."""
+        """Return which flexibilities (2n,) exceed their own 1 sigma; others have no share."""
         std = np.sqrt(np.diag(self.scatter.covariance))
         return np.asarray(self.scatter.identifiable & (self.scatter.mean > std))
 

@@ -141,7 +141,7 @@ class Selection:
         A link's value several times the machining tolerance of all others has to be as significant
         as a single cause. Of single links it is the farthest one only, since others may depend on
         it. Of other effects it is what is not identifiable: it may be anything. (A tool of a UR10
-        stood 67 mm off along an axis whose standard deviation was 47 mm.)
+        stood 20 mm off along its axis, with a standard deviation of 47 mm.)
         """
         implausible: dict[int, Mask] = {}
         single: dict[int, tuple[Mask, float]] = {}

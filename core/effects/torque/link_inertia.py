@@ -31,7 +31,7 @@ class LinkInertia(JointEffect):
     channels = ("torque",)
     simulated_as = Kind.LINK_SCALE
     motion = "many poses, and accelerations of all joints up to the link"
-    # joint i stands for link i, which it turns
+    # joint i is the one that turns link i
     fixed_parameters = (Parameter("", "", 0.05, -1.0, 20.0),)
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:

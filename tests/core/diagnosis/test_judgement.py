@@ -334,10 +334,10 @@ def test_a_single_links_length_far_from_machining_has_to_be_significant(
     ("deviation", "nominal"), [(47e-3, {0: [False, False, True]}), (29e-3, {}), (10e-3, {})]
 )
 def test_an_axis_of_the_tool_that_is_not_identifiable_is_the_cells(deviation, nominal):
-    """The tool of a UR10 stood 67 mm off along its axis, one of four answers another time 20 mm."""
+    """The tool of a UR10 stood 20 mm off along its axis, with a standard deviation of 47 mm."""
     tool = SimpleNamespace(effect=effect_named("tool_frame"), scales=np.full(3, 1e-3))
     found = SimpleNamespace(
-        terms=[Term("tool_frame", Site(), (1e-4, 5e-4, -0.0666, 0.0, 0.0, 0.0))],
+        terms=[Term("tool_frame", Site(), (1e-4, 5e-4, -0.0197, 0.0, 0.0, 0.0))],
         covariance=[np.diag([1e-8, 1e-8, deviation**2])], term_index=(0,), prior={},
         observation=SimpleNamespace(channel="position"),
         space=SimpleNamespace(candidates=[tool]),
