@@ -25,7 +25,13 @@ from gapbridge.drivers.canopen import driver as canopen_driver
 from gapbridge.drivers.canopen import master as canopen_master
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.master import AllowedFrames, Master
-from gapbridge.drivers.canopen.objects import ENABLE_OPERATION, RPDO_BASE, SYNC, TPDO_BASE
+from gapbridge.drivers.canopen.objects import (
+    DISABLE_VOLTAGE,
+    ENABLE_OPERATION,
+    RPDO_BASE,
+    SYNC,
+    TPDO_BASE,
+)
 from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.driver import Driver
 
@@ -353,7 +359,10 @@ class CanopenLink(SimulatedLink):
         return found
 
     def leave_mode(self) -> None:
-        """See SimulatedLink.leave_mode: arming sets modes and states."""
+        """See SimulatedLink.leave_mode: whoever changed a mode switches the drive off."""
+        for drive in self.drives.drives:
+            if drive.axis.holds and drive.axis.mode != self.profile.mode_number:
+                drive.axis.machine.control(DISABLE_VOLTAGE)
 
     def foreign(self, seconds: float) -> None:
         """Have another master send SYNCs, for a while."""

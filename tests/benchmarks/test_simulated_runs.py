@@ -242,6 +242,11 @@ def test_the_answer_to_a_closed_connection_is_nobodys() -> None:
     assert not when_four(3000286).violations
 
 
+@pytest.mark.parametrize("seed", [8248, 8824])  # else arming is refused for good
+def test_a_drive_whose_mode_changes_while_the_link_is_lost_arms_after_it_was_off(seed: int) -> None:
+    assert not run(seed).violations
+
+
 @pytest.mark.parametrize("seed", [5005572, 5025157])
 def test_a_clock_that_is_set_forward_behind_jitter_makes_no_state_younger(seed: int) -> None:
     assert not when_four(seed).violations
