@@ -9,8 +9,9 @@ import pytest
 import small_arm as small
 
 from gapbridge.bridge.document.diagnosis_json import document
-from gapbridge.core.diagnosis import diagnosis as core
+from gapbridge.core.diagnosis import channel_search
 from gapbridge.core.diagnosis.channels.position import observe
+from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import ChannelFinding, Check, NotAccused
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
@@ -61,11 +62,11 @@ def test_what_makes_the_gap_larger_is_no_cause(monkeypatch):
         sizes = sizes_of(*arguments)
         return replace(sizes, remaining_rms=1.1 * sizes.gap_rms)
 
-    sizes_of = core.sizes_of
-    monkeypatch.setattr(core, "sizes_of", larger)
+    sizes_of = channel_search.sizes_of
+    monkeypatch.setattr(channel_search, "sizes_of", larger)
     session = small.session_of(0)
     read = small.readings(small.turned(2, lambda s, q: np.full(len(q), 8e-4)), session)
-    found = core.diagnose(
+    found = diagnose(
         small.model_of(), small.log_of(session, read), Metrology(registered=True, sigma=small.SIGMA)
     )
     (channel,) = found.channels
