@@ -19,8 +19,12 @@ from gapbridge.bridge.fleet.task import MAX_DEATHS, Outcome, Task, run_task
 from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import RunError
 
-# one thread per process: threads do not speed up matrices of this size
-THREAD_VARS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+VARIABLES = (
+    # one thread per process: threads do not speed up matrices of this size
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS",
+    "PYTHONSAFEPATH",  # else ``python -c`` imports first what lies in the working folder
+)  # fmt: skip
+"""Environment variables of every process, set to 1."""
 MAX_FAILED_STARTS = 3  # in a row, after which the run fails
 READY = "ready"
 QUEUED = 2  # tasks sent to a process, so that it never waits
@@ -124,8 +128,8 @@ class LocalWorkers(Workers):
 def _spawn() -> _Worker:
     context = multiprocessing.get_context("spawn")
     pipe, worker_pipe = context.Pipe()
-    before = {name: os.environ.get(name) for name in THREAD_VARS}
-    os.environ.update(dict.fromkeys(THREAD_VARS, "1"))
+    before = {name: os.environ.get(name) for name in VARIABLES}
+    os.environ.update(dict.fromkeys(VARIABLES, "1"))
     try:
         process = context.Process(target=_serve, args=(worker_pipe,), daemon=True)
         process.start()

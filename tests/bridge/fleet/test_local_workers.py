@@ -80,3 +80,15 @@ def test_an_unforeseen_error_becomes_one_line_and_harms_nobody_else(tmp_path: Pa
     assert odd.error.endswith("odd.csv: ZeroDivisionError: the odd one")
     assert "Traceback" in odd.details
     assert outcomes["a/even"].state == DONE
+
+
+def test_workers_import_nothing_from_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("pickle", "yaml", "core"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    with LocalWorkers(1) as workers:
+        (outcome,) = workers.run(tasks_in(tmp_path, ["a/s"], count_rows))
+    assert outcome.state == DONE
+    assert not (tmp_path / "imported").exists()
