@@ -42,7 +42,10 @@ class VerifyJob(Job):
     """Compares poses across the workspace, under each load, with the accuracy baseline."""
 
     def _baseline(self) -> AccuracyBaseline:
-        """Return the accuracy baseline of the calibration. Raises InputError if there is none."""
+        """Return the accuracy baseline of the calibration.
+
+        Raises InputError if there is none, or that of another calibration.
+        """
         path = baseline_path(self.cell.path)
         try:
             document = json.loads(path.read_text(encoding="utf-8"))
@@ -56,7 +59,15 @@ class VerifyJob(Job):
             ) from None
         if not isinstance(document, dict):
             raise InputError(f"{path}: found no mapping, expected an accuracy baseline")
-        return read_baseline(document, str(path))
+        baseline, spread = read_baseline(document, str(path)), self.cell.spread
+        if baseline.names != spread.names or not np.allclose(
+            baseline.covariance, spread.covariance, rtol=1e-9, atol=0.0
+        ):
+            raise InputError(
+                f"{path}: found the accuracy baseline of another calibration, expected that of "
+                f"{self.cell.path}: its `parameters` and `covariance` are those of `provenance`"
+            )
+        return baseline
 
     def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
         """Return poses far apart from each other, in the order of travel, load by load."""

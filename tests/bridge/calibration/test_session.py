@@ -367,6 +367,20 @@ def test_a_few_poses_neither_pass_a_verification_nor_remove_the_mark(
     assert "the zero of joint 5" in read_mark(cell)
 
 
+def test_a_baseline_of_another_calibration_is_refused(
+    clean: tuple[Path, CommandResult], tmp_path: Path
+) -> None:
+    document = json.loads((clean[0] / "new.promise.json").read_text(encoding="utf-8"))
+    other = {**document, "covariance": (1.01 * np.array(document["covariance"])).tolist()}
+    for name, baseline in (("cell", document), ("new", other)):  # not calibrated; another arm
+        shutil.copy(clean[0] / f"{name}.yaml", tmp_path)
+        (tmp_path / f"{name}.promise.json").write_text(json.dumps(baseline), encoding="utf-8")
+        cell = tmp_path / f"{name}.yaml"
+        result = run_calibrate(cell, "--verify", "--session", tmp_path / f"s-{name}")
+        assert result.code == 2
+        assert f"{name}.promise.json: found the accuracy baseline of another" in result.err
+
+
 def test_a_failed_verification_marks_the_cell_even_where_its_files_cannot_be_written(
     clean: tuple[Path, CommandResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
