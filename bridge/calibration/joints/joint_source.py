@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Self
 
@@ -52,8 +53,16 @@ class JointSource(ABC):
     def sample_at_rest(self, pose: PlannedPose) -> JointSample:
         """Return a sample of the arm at rest. Raises ReadingError if it does not come to rest."""
 
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Observe the arm while the block runs, for ``unmoved_since``."""
+        yield
+
     def unmoved_since(self, sample: JointSample) -> bool:
-        """Return whether the arm has not moved since the sample; raises ReadingError: unknown."""
+        """Return whether the arm has not moved since the sample; raises ReadingError: unknown.
+
+        ``sample``: the newest one. A motion to and fro is noticed in a block that is watched.
+        """
         return True
 
     def move_to(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:

@@ -7,7 +7,8 @@ through the limiter, without corrections; once the arm rests there the daemon on
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -44,6 +45,7 @@ ACCELERATION = 1.0  # rad/s2, of the fastest joint
 MIN_DURATION = 0.5  # s of a move
 DWELL = 0.2  # s at the end of a move
 BUFFER_SPAN = 5.0  # s of cycles in memory, beyond the time in which the arm settles
+MEAN_SPAN = 0.1  # s of cycles, in whose mean a motion is told from noise
 SILENCE = 0.5  # s without a cycle after which it is unknown where the arm is
 DIRECTION_THRESHOLD = 1e-5  # rad: least motion that sets the approach direction
 ACTIVE = (State.ARMED.name, State.COMPENSATING.name, State.HOLDING.name)
@@ -90,7 +92,7 @@ class LinkedJoints(JointSource):
     def current_q(self) -> Array | None:
         """Return the joint angles (n,), rad, of the newest cycle; None while the link is silent."""
         try:
-            rows = self._recent_cycles(0.1)
+            rows = self._recent_cycles(MEAN_SPAN)
         except ReadingError:
             return None
         return np.asarray(rows[-1, self._columns("actual_q")])
@@ -116,11 +118,31 @@ class LinkedJoints(JointSource):
         why = "the force at the tool is not steady" if self._at_rest() else "the arm moves"
         raise ReadingError(f"{why}, expected it at rest for {self._settle:g} s")
 
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Read the cycles while the block runs: it may last longer than the memory holds."""
+        run, ended = self._active_run(), False
+
+        def watch() -> None:
+            while not ended:
+                run.read_cycles()
+                self._clock.sleep(MEAN_SPAN)
+
+        thread = threading.Thread(target=watch, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended = True
+            thread.join()  # cycles are read by one thread at a time
+
     def unmoved_since(self, sample: JointSample) -> bool:
-        """Return whether the arm has not moved since the sample; raises ReadingError: unknown."""
-        rows = self._recent_cycles(0.1)
+        """Return whether the arm has rested at the newest sample; raises ReadingError: unknown."""
+        rows, run = self._recent_cycles(MEAN_SPAN), self._active_run()
         q = rows[:, self._columns("actual_q")].mean(axis=0)
-        return bool(np.abs(q - sample.q).max() < MOTION_THRESHOLD)
+        if run.interrupted:
+            raise ReadingError("the link was interrupted, expected the arm's joints throughout")
+        return not run.left and bool(np.abs(q - sample.q).max() < MOTION_THRESHOLD)
 
     def move_to(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
         """Move the arm to a pose at ``speed`` and wait until it rests there.
@@ -243,6 +265,7 @@ class LinkedJoints(JointSource):
 
         q, payload = mean("actual_q"), mean("payload")
         assert q is not None
+        run.rest_at(q)
         return JointSample(
             q=q,
             temperature=mean("joint_temperatures"),
@@ -278,6 +301,9 @@ class DaemonRun:
         self.rows = np.empty((0, self.daemon.memory.width))
         self.approach = np.zeros(self.daemon.memory.n)
         self._last_moved: Array | None = None  # (n,) rad, where each joint last moved to
+        self._rest: tuple[float, Array] | None = None  # controller's s, (n,) rad of a sample
+        self.left = False  # the arm has been elsewhere since the sample
+        self.interrupted = False  # nothing is known of the arm for a while since the sample
         self._reader: CycleReader | None = self.daemon.memory.reader()
         self._messages: list[str] = []
         self._mark = 0  # number of the first message since it was armed, or began to write
@@ -339,6 +365,26 @@ class DaemonRun:
         recent = timestamp >= timestamp[-1] - self._span
         recent[: np.append(0, np.flatnonzero(breaks) + 1)[-1]] = False
         self.rows = rows[recent]
+        self.interrupted |= bool(breaks.any())
+        self._note_motion()
+
+    def rest_at(self, q: Array) -> None:
+        """Note where the arm rests from now on, (n,) rad, and forget that it moved before."""
+        self._rest = float(self.rows[-1, self.slices["timestamp"].start]), q
+        self.left = self.interrupted = False
+
+    def _note_motion(self) -> None:
+        """Note whether the arm has left where it rested, in the mean of any MEAN_SPAN."""
+        if self._rest is None or self.interrupted:
+            return
+        since, rest = self._rest
+        timestamp = self.rows[:, self.slices["timestamp"].start]
+        rows, span = self.rows[timestamp > since], timestamp[timestamp > since] // MEAN_SPAN
+        begins = np.flatnonzero(np.diff(span)) + 1  # of whole spans, and of the present one
+        if len(begins) > 1:
+            sums = np.add.reduceat(rows[:, self.slices["actual_q"]], begins)[:-1]
+            means = sums / np.diff(begins)[:, None]
+            self.left |= bool(np.abs(means - rest).max() > MOTION_THRESHOLD)
 
     def _update_approach(self, q: Array) -> None:
         last = q[0].copy() if self._last_moved is None else self._last_moved

@@ -54,7 +54,8 @@ def capture(
 
     ``joint_sample`` None: the joints are sampled after the instrument was read.
     """
-    samples = instrument.read(request)
+    with joints.watched():
+        samples = instrument.read(request)
     if joint_sample is None:
         joint_sample = joints.sample_at_rest(pose)
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from types import SimpleNamespace
 from typing import Any
 
@@ -65,6 +66,7 @@ def observed(
     run.slices, run.rows, run.daemon = SLICES, controller.drain(), daemon
     run.approach, run._last_moved, run._reader = np.zeros(6), None, controller
     run._thread, run._span = SimpleNamespace(is_alive=lambda: True), settle + BUFFER_SPAN
+    run._rest, run.left, run.interrupted = None, False, False
     joints: Any = object.__new__(LinkedJoints)
     joints._run, joints._clock, joints._settle = run, clock, settle
     return joints, daemon
@@ -148,3 +150,51 @@ def test_rest_is_not_counted_from_before_a_gap(clock: ByHand, controller: Contro
     assert joints.arrived(pose_at(HERE)) is None
     controller.reports(HERE, 0.5)
     assert joints.arrived(pose_at(HERE)) is not None
+
+
+@pytest.mark.parametrize(
+    ("meanwhile", "unmoved"),
+    [
+        ([(HERE, 60.0)], True),
+        ([(HERE, 3.0), (THERE, 0.3), (HERE, 60.0)], False),
+        ([(HERE, 3.0), (HERE + 4e-4, 0.3), (HERE, 60.0)], False),
+    ],
+)
+def test_an_arm_that_leaves_and_comes_back_while_a_reading_is_awaited_is_noticed(
+    clock: ByHand, controller: Controller, meanwhile: list[tuple[Array, float]], unmoved: bool
+) -> None:
+    joints, _ = observed(controller, clock)
+    controller.reports(HERE, 1.0)
+    for phases, expected in ((list(meanwhile), unmoved), ([(HERE, 10.0)], True)):
+        sample = joints.sample_at_rest(pose_at(HERE))
+        await_reading(joints, controller, clock, phases)
+        assert joints.unmoved_since(sample) is expected
+
+
+def test_a_link_that_was_silent_while_a_reading_was_awaited_is_noticed(
+    clock: ByHand, controller: Controller
+) -> None:
+    joints, _ = observed(controller, clock)
+    controller.reports(HERE, 1.0)
+    sample = joints.sample_at_rest(pose_at(HERE))
+    clock.sleep(2.0)
+    await_reading(joints, controller, clock, [(HERE, 60.0)])
+    with pytest.raises(ReadingError, match="the link was interrupted"):
+        joints.unmoved_since(sample)
+
+
+def await_reading(
+    joints: LinkedJoints, controller: Controller, clock: ByHand, phases: list[tuple[Array, float]]
+) -> None:
+    """Watch the arm until it has been through all phases (joints, s)."""
+    over = threading.Event()
+
+    def go_on(seconds: float) -> None:
+        if phases:
+            controller.reports(*phases.pop(0))
+        else:
+            over.set()
+
+    joints._clock = SimpleNamespace(sleep=go_on, monotonic=clock.monotonic)  # type: ignore[assignment]
+    with joints.watched():
+        over.wait()
