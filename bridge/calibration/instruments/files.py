@@ -18,7 +18,7 @@ from gapbridge.bridge.calibration.instruments.instrument import (
     ReadRequest,
     Samples,
 )
-from gapbridge.bridge.calibration.instruments.numbers import parse_numbers, to_si
+from gapbridge.bridge.calibration.instruments.numbers import check_header, parse_numbers, to_si
 from gapbridge.bridge.cell.settings.instruments import ExportSettings, FileSettings, FolderSettings
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InputError
@@ -66,6 +66,11 @@ class Table:
                 f"{len(self.names)} as in the header"
             )
         cells = row.cells[-count:] if columns is None else self._select(row, columns)
+        try:
+            for name in self.names[-count:] if columns is None else columns:
+                check_header(name, settings.units)
+        except ReadingError as error:
+            raise InputError(f"{self.path}: column {name}: {error}") from None
         try:
             return parse_numbers(";".join(cells), count, *settings.units)
         except ReadingError as error:

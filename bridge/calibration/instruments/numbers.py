@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,7 +15,10 @@ from gapbridge.core.rotation import rotation_vector, rpy_matrix
 
 MAX_RANGE = 100.0  # m, of an instrument
 _NAME = re.compile(r"[A-Za-z_][A-Za-z_0-9]*\s*[:=]")  # the label in "X = 12.3"
-_UNIT = re.compile(r"(?<=[\d.,\s])(mm|um|µm|m|in|deg|rad|°)(?=[\s,;]|$)")
+_UNITS = r"(mm|cm|um|µm|μm|m|inch(?:es)?|in|\"|ft|deg|rad|°)"
+_UNIT = re.compile(rf"(?<=[\d.,\s]){_UNITS}(?=[\s,;]|$)", re.IGNORECASE)
+_HEADER_UNIT = re.compile(rf"[\[(]\s*{_UNITS}\s*[\])]")  # as in "X [mm]"
+_SPELLINGS = {"µm": "um", "μm": "um", "inch": "in", "inches": "in", '"': "in", "°": "deg"}
 
 
 def parse_numbers(text: str, count: int, *units: str) -> list[float]:
@@ -25,12 +29,7 @@ def parse_numbers(text: str, count: int, *units: str) -> list[float]:
     """
     plain = _NAME.sub(" ", text.strip())
     for written in _UNIT.findall(plain):
-        standard = {"µm": "um", "°": "deg"}.get(written, written)
-        if units and standard not in units:
-            same = [unit for unit in units if (unit in RADIANS) == (standard in RADIANS)]
-            raise ReadingError(
-                f"found {written}, expected {(*same, *units)[0]}: the unit declared for it"
-            )
+        _require_declared(written, units)
     plain = _UNIT.sub(" ", plain)
     values = []
     for token in _tokens(plain, count):
@@ -44,6 +43,22 @@ def parse_numbers(text: str, count: int, *units: str) -> list[float]:
     if not all(map(math.isfinite, values)):
         raise ReadingError(f"found {text!r}, expected finite numbers")
     return values
+
+
+def _require_declared(written: str, units: Sequence[str]) -> None:
+    """Raise ReadingError for a unit that is not one of ``units``; none: any is accepted."""
+    standard = _SPELLINGS.get(written.lower(), written.lower())
+    if units and standard not in units:
+        same = [unit for unit in units if (unit in RADIANS) == (standard in RADIANS)]
+        raise ReadingError(
+            f"found {written}, expected {(*same, *units)[0]}: the unit declared for it"
+        )
+
+
+def check_header(name: str, units: Sequence[str]) -> None:
+    """Raise ReadingError where a column's name has in brackets another unit than ``units``."""
+    for written in _HEADER_UNIT.findall(name):
+        _require_declared(written, units)
 
 
 def _tokens(text: str, count: int) -> list[str]:

@@ -38,6 +38,8 @@ from gapbridge.core.rotation import roll_pitch_yaw
 
 POSES = 6
 MIN_DECLARED = 0.3  # kg, of a cell, that a sensor does not overlook
+FORCE_UNITS = {"lbf": 4.4482, "kgf": 9.80665, "kN": 1e3, "ozf": 0.27801}  # N
+UNIT_MATCH = 0.03  # of the declared mass, by which a unit is recognised
 
 
 class _ShortJob(Job):
@@ -164,6 +166,11 @@ class PayloadJob(_ShortJob):
             self.session.add("ended", applied=None)
             self.prompt.warn(f"nothing is applied: {why}")
             return
+        if unit := _unit_instead_of_newtons(result.mass, self.cell.file.payload.mass):
+            self.prompt.warn(
+                f"{number_text(result.mass)} kg instead of the cell's "
+                f"{self.cell.file.payload.mass:g} kg: does the sensor read {unit}? expected N"
+            )
         applied = result.applied(self.cell.model)
         payload = {"mass": applied.payload_mass, "cog": [float(v) for v in applied.payload_cog]}
         self.write_new_cell(applied, "the cell with this load", {"payload": payload})
@@ -180,3 +187,15 @@ class PayloadJob(_ShortJob):
                     "readings raw and in flange axes? A bare flange has payload.mass: 0 in the cell"
                 )
         return ""
+
+
+def _unit_instead_of_newtons(mass: float, declared: float) -> str:
+    """Return the unit of force in which a sensor would weigh ``declared`` kg as ``mass``."""
+    return next(
+        (
+            unit
+            for unit, newtons in FORCE_UNITS.items()
+            if declared > 0.0 and abs(mass * newtons / declared - 1.0) < UNIT_MATCH
+        ),
+        "",
+    )

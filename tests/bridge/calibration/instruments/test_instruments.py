@@ -55,7 +55,7 @@ def test_every_kind_that_a_cell_may_name_has_an_instrument() -> None:
     [
         "1234.5 -67.25 890", "1234.5, -67.25, 890", "1234,5; -67,25; 890", "1234,5\t-67,25\t890",
         "X=1234.5 Y=-67.25 Z=890", "1234.5 mm, -67.25 mm, 890 mm", "  1234.5,-67.25,890.0  ",
-        "x: 1.2345e3, y: -67.25, z: 890", "1234,5 -67,25 890,0",
+        "x: 1.2345e3, y: -67.25, z: 890", "1234,5 -67,25 890,0", "1234.5 -67.25 890 MM",
     ],
 )  # fmt: skip
 def test_a_point_is_understood_however_it_is_written(line: str) -> None:
@@ -72,6 +72,9 @@ def test_a_point_is_understood_however_it_is_written(line: str) -> None:
         ("1 2 nan", "expected finite numbers"),
         ("1 m 2 m 3 m", "found m, expected mm"),
         ("1 deg 2 3", "found deg, expected mm"),
+        ("1 cm 2 cm 3 cm", "found cm, expected mm"),
+        ('1" 2" 3"', 'found ", expected mm'),
+        ("1 2 3 inch", "found inch, expected mm"),
         ("1_0 2 3", "found '1_0', expected a number"),
         ("", "found 0 numbers"),
         ("1e9 2 3", "is the unit right?"),
@@ -189,6 +192,19 @@ def test_a_bad_row_is_named(tmp_path: Path, text: str, phrase: str) -> None:
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ReadingError, match=phrase):
         instrument("file", unit="m", file=str(file)).read(ReadRequest())
+
+
+@pytest.mark.parametrize("columns", [None, ("X [in]", "Y [in]", "Z [in]")])
+def test_a_header_with_another_unit_is_refused(
+    tmp_path: Path, columns: tuple[str, ...] | None
+) -> None:
+    file = tmp_path / "readings.csv"
+    file.write_text("T (deg),X [in],Y [in],Z [in]\n20,39.37,78.74,11.81\n", encoding="utf-8")
+    keys = {"file": str(file), "columns": columns}
+    with pytest.raises(InputError, match=r"csv: column X \[in\]: found in, expected mm: the unit"):
+        instrument("file", unit="mm", **keys).read(ReadRequest())
+    found = instrument("file", unit="in", **keys).read(ReadRequest())
+    np.testing.assert_allclose(found.values, [[1.0, 2.0, 0.3]], rtol=1e-3)
 
 
 def test_a_row_too_short_for_its_named_columns_is_named(tmp_path: Path) -> None:

@@ -88,6 +88,18 @@ def test_a_declared_load_that_the_sensor_does_not_find_is_not_taken_away(
     assert ended(job) == [None]
 
 
+@pytest.mark.parametrize("job", ["payload: {mass: 5.0}\n"], indirect=True)
+@pytest.mark.parametrize(("mass", "unit"), [(5.0 / 4.448, "lbf"), (5.0 / 9.807, "kgf"), (1.3, "")])
+def test_a_load_as_a_sensor_in_another_unit_weighs_it_is_warned_of(
+    job: PayloadJob, capsys: pytest.CaptureFixture[str], mass: float, unit: str
+) -> None:
+    measure(job, mass)
+    job.finish()
+    shown = " ".join(capsys.readouterr().out.split())
+    assert ("does the sensor read" in shown) is bool(unit)
+    assert f"cell's 5 kg: does the sensor read {unit}? expected N" in shown or not unit
+
+
 def test_a_cell_made_of_one_whose_verification_failed_is_marked_too(
     job: PayloadJob, tmp_path: Path
 ) -> None:
