@@ -124,6 +124,7 @@ def _run(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session) 
             if not job.starts_at_current_pose:
                 _open(prompt, stack, joints)
             _measure(job, joints, instrument)
+    job.require_same_cell()
     job.finish()
 
 

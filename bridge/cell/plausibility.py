@@ -115,6 +115,9 @@ def _session(section: CalibrationSettings, arm: Arm, arm_reach: float) -> Iterat
         yield Implausible(where, f"{sigma:g} m", "less than 0.001 m", sure=False)
     if section.accuracy is not None and section.accuracy >= SIGMA_ERROR:
         yield Implausible((top, "accuracy"), f"{section.accuracy:g}", "m (it looks like mm)")
+    if (floor := section.floor or 0.0) < -(LENGTH_ERROR_FACTOR * arm_reach + 1.0):
+        expected = "m, null for none (mm? the arm does not reach it)"
+        yield Implausible((top, "floor"), f"{floor:g}", expected, sure=False)
     places: list[tuple[tuple[str | int, ...], Sequence[float]]] = [
         ((top, "floor"), [section.floor or 0.0]),
         ((top, "instrument_at"), section.instrument_at or []),

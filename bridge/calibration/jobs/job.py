@@ -19,6 +19,7 @@ from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.document import read_document
 from gapbridge.bridge.cell.saving import cell_text
 from gapbridge.bridge.cell.verification_mark import read_mark, remove_mark, write_mark
 from gapbridge.bridge.document.notes import note_text, short_text
@@ -29,6 +30,7 @@ from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.tool_session import ToolCalibration
+from gapbridge.core.errors import InputError
 from gapbridge.core.log.columns import as_table
 from gapbridge.core.model import Model
 
@@ -76,6 +78,19 @@ class Job(ABC):
     def finish(self) -> None:
         """Fit the readings, write the report, and write a new cell if the operator confirms."""
 
+    def require_same_cell(self) -> None:
+        """Raise InputError where the cell file was changed since the command read it.
+
+        A session lasts for hours: a result of the old cell would undo the change, and name the
+        SHA-256 of the new one as its origin.
+        """
+        path = self.cell.path
+        if read_document(path).text != self.cell.document.text:
+            raise InputError(
+                f"{path}: found it changed since the command was started, expected the same: rerun "
+                "it to evaluate the readings with the cell as it is now"
+            )
+
     def report_short(
         self, result: PayloadCalibration | ToolCalibration, lines: Sequence[str],
         instrument: tuple[str, str],
@@ -115,6 +130,7 @@ class Job(ABC):
             self.session.add("ended", applied=None)
             prompt.say(f"nothing is applied; fit and report are kept in {self.folder}")
             return None
+        self.require_same_cell()
         require_writable(target, cell.path)
         origin = provenance({"log": [self.session.journal.path], "cell": [cell.path]})
         kept = cell.file.provenance

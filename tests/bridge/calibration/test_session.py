@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from scripted_session import (
     write_cell,
 )
 
+from gapbridge.bridge.calibration.jobs import calibrate as calibrate_module
 from gapbridge.bridge.calibration.jobs import verify as verify_module
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
@@ -365,6 +367,30 @@ def test_a_few_poses_neither_pass_a_verification_nor_remove_the_mark(
     assert "found 3 poses measured, expected at least 6" in result.err
     assert "to measure anew give another --session" in result.out
     assert "the zero of joint 5" in read_mark(cell)
+
+
+def test_a_cell_edited_during_its_session_is_not_replaced_by_one_without_the_edit(
+    clean: tuple[Path, CommandResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell, session = tmp_path / "cell.yaml", tmp_path / "s"
+    shutil.copytree(clean[0] / "s", session)
+    shutil.copy(clean[0] / "cell.yaml", cell)
+    evaluate = calibrate_module.evaluate_session
+
+    def edit(*arguments: Any) -> Any:
+        with cell.open("a", encoding="utf-8") as file:
+            file.write("limits: {joint_margin: 0.03}\n")
+        return evaluate(*arguments)
+
+    given = ("--session", session, "--apply", tmp_path / "new.yaml")
+    with monkeypatch.context() as patched:
+        patched.setattr(calibrate_module, "evaluate_session", edit)
+        result = run_calibrate(cell, *given, lines=["yes"])
+    assert result.code == 2
+    assert "cell.yaml: found it changed since the command was started" in result.err
+    assert not (tmp_path / "new.yaml").exists()
+    assert run_calibrate(cell, *given, lines=["yes"]).code == 0
+    assert "limits: {joint_margin: 0.03}" in (tmp_path / "new.yaml").read_text(encoding="utf-8")
 
 
 def test_a_baseline_of_another_calibration_is_refused(

@@ -111,6 +111,7 @@ def test_an_impossible_value_is_an_error_with_its_line(
             ARM + "calibration: {instrument: {kind: typed, unit: mm, sigma: 0.005}}",
             "calibration.instrument.sigma",
         ),
+        (session("floor: -50"), "null for none (mm?"),
         (ARM + "reference_temperature: 77", "Fahrenheit"),
         (ARM + "tool: {tcp: {xyz: [0, 0, 1.8]}}", "reach"),
         (ARM + "compliance: {radial: [0.05, 0, 0, 0, 0, 0]}", "rad/Nm"),
