@@ -61,10 +61,8 @@ def run_session(cell: Cell, options: SessionOptions) -> None:
         try:
             _run(cell, options, prompt, session)
         except SessionCommand as command:
-            if command.name == "undo" and session.accepted:  # at the last question
-                session.add("undo", stop=session.accepted[-1].stop)
-                stop = (session.next_stop or 0) + 1
-                prompt.say(f"discarded the last reading; stop {stop} is to be measured")
+            if command.name == "undo":  # at the last question
+                prompt.say(session.undo())
             prompt.say(_how_to_resume(cell, options, session))
         except InputEnded:
             prompt.say()

@@ -15,7 +15,7 @@ from gapbridge.bridge.calibration.instruments.instrument import (
 )
 from gapbridge.bridge.calibration.joints.joint_source import JointSample, JointSource, TypedJoints
 from gapbridge.bridge.calibration.planning import REPEATABILITY
-from gapbridge.bridge.calibration.session.positioning import Positioning
+from gapbridge.bridge.calibration.session.positioning import AT_POSE, Positioning
 from gapbridge.bridge.calibration.session.prompt import Prompt, SessionCommand
 from gapbridge.bridge.calibration.session.reading_check import NOT_CHECKED, ReadingCheck, Verdict
 from gapbridge.bridge.calibration.session.session import Reading, Session, stop_header
@@ -176,6 +176,7 @@ class Measuring:
                 else:
                     with self.prompt.waiting(f"reading {self.instrument.name}"):
                         captured = self._capture(stop, joint_sample)
+                self._require_another_contact(pose, captured.joint_sample.q)
                 break
             except ReadingError as error:
                 self.prompt.warn(str(error))
@@ -203,6 +204,18 @@ class Measuring:
         request = ReadRequest(stop + 1, self._samples, frozenset(self.session.used_sources))
         pose, joints = self.session.stops[stop], self.positioning.joints
         return capture(self.instrument, joints, pose, joint_sample, request)
+
+    def _require_another_contact(self, pose: PlannedPose, q: Array) -> None:
+        """Raise ReadingError where the arm is still in contact as for another pose.
+
+        Enter pressed twice would count one touch as two, with too small a standard deviation.
+        """
+        for other in self.session.accepted if self.instrument.contact else ():
+            same = np.abs(other.q - q).max() < AT_POSE
+            if same and self.session.stops[other.stop].number != pose.number:
+                raise ReadingError(
+                    f"found the joints of stop {other.stop + 1}, expected another orientation"
+                )
 
     def check(self, reading: Reading, captured: CapturedReading) -> Verdict:
         """Check a reading against the readings so far, and the scatter of its samples."""
@@ -276,7 +289,7 @@ class Measuring:
     def _run_command(self, command: SessionCommand, stop: int) -> None:
         """Execute a command of the session at a stop."""
         if command.name == "undo":
-            self._undo()
+            self.prompt.say(f"  {self.session.undo()}")
         elif command.name == "skip":
             self.session.add("skip", stop=stop)
             self.prompt.say(f"  stop {stop + 1} is skipped")
@@ -286,14 +299,6 @@ class Measuring:
             self.mark_moved(command.name)
         else:
             raise command
-
-    def _undo(self) -> None:
-        if not self.session.accepted:
-            self.prompt.say("  no reading to discard")
-            return
-        last = self.session.accepted[-1]
-        self.session.add("undo", stop=last.stop)
-        self.prompt.say(f"  discarded the reading of stop {last.stop + 1}")
 
     def mark_moved(self, what: str, since: int | None = None) -> None:
         """Start a new station (``moved``) or target (``slipped``) from reading ``since`` on."""

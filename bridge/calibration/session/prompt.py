@@ -16,7 +16,7 @@ from rich.status import Status
 T = TypeVar("T")
 POLL_INTERVAL = 0.1  # s
 COMMANDS = {
-    "undo": "discard the last reading and measure that pose again",
+    "undo": "discard the last reading, or the skip after it, and measure that pose again",
     "back": "measure an earlier pose again: has the instrument or the target moved?",
     "moved": "the instrument has been moved: new frame from the next reading on",
     "slipped": "the target has moved on the tool: from the next reading on",

@@ -68,7 +68,7 @@ class Session:
     plan: Plan | None = None
     accepted: list[Reading] = field(default_factory=list)
     undone: int = 0  # number of readings discarded with `undo`
-    skipped: set[int] = field(default_factory=set)  # stops
+    skipped: dict[int, int] = field(default_factory=dict)  # stop -> count of readings before
     mounted: int | None = None  # index in Plan.loads of the load on the flange
     station: int = 0  # of the instrument, as in Reading: also counts unplanned moves
     place: int = 0  # planned position of the instrument, as PlannedPose.station
@@ -103,6 +103,18 @@ class Session:
         """Write an entry to the journal, then apply it."""
         self.apply(self.journal.add(kind, **fields))
 
+    def undo(self) -> str:
+        """Discard the last reading, or the skip after it; returns what was done as text."""
+        skips = [stop for stop, before in self.skipped.items() if before >= len(self.accepted)]
+        if skips:
+            stop, done = skips[-1], "to be measured after all: stop"
+        elif self.accepted:
+            stop, done = self.accepted[-1].stop, "discarded the reading of stop"
+        else:
+            return "no reading to discard"
+        self.add("undo", stop=stop)
+        return f"{done} {stop + 1}"
+
     def apply(self, entry: Entry) -> None:
         """Apply an entry of the journal; unknown kinds are ignored."""
         match entry["kind"]:
@@ -117,12 +129,15 @@ class Session:
                 self.has_ended = True
             case "rejected":
                 self.used_sources |= {entry.get("source", ""), *entry.get("sources", ())}
+            case "undo" if entry.get("stop") in self.skipped:
+                del self.skipped[entry["stop"]]
+                self.has_ended = False
             case "undo":
                 self.undone += 1
                 self.has_ended = False
                 self.accepted.pop()
             case "skip":
-                self.skipped.add(int(entry["stop"]))
+                self.skipped[int(entry["stop"])] = len(self.accepted)
             case "mounted":
                 self.mounted = int(entry["load"])
             case "moved":
@@ -162,7 +177,7 @@ class Session:
     @property
     def open_stops(self) -> list[int]:
         """Return the stops that are neither measured nor skipped."""
-        done = {r.stop for r in self.accepted} | self.skipped
+        done = {r.stop for r in self.accepted}.union(self.skipped)
         return [i for i in range(len(self.stops)) if i not in done]
 
     @property

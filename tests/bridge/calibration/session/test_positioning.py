@@ -17,8 +17,9 @@ from scripted_positioning import (
 
 from gapbridge.bridge.calibration.instruments.files import ReadingsFile
 from gapbridge.bridge.calibration.instruments.instrument import InstrumentContext, ReadingError
+from gapbridge.bridge.calibration.instruments.joint_only import PointContact
 from gapbridge.bridge.calibration.joints.joint_source import JointSample
-from gapbridge.bridge.cell.settings.instruments import FileSettings
+from gapbridge.bridge.cell.settings.instruments import FileSettings, PointSettings
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import LinkError, RunError
 
@@ -126,3 +127,31 @@ def test_enter_does_not_measure_an_arm_that_reports_nothing() -> None:
     with pytest.raises(ScriptEnded, match="measured as soon as it rests there"):
         measuring(session_of(1), prompt, ScriptedJoints(None), Tracker(manual=True)).run()
     assert "! the controller reports no joints now: is the link to the arm up?" in prompt.shown
+
+
+def test_a_touch_that_is_confirmed_twice_counts_once() -> None:
+    arm, session = ScriptedJoints(np.full(6, 0.1)), session_of(2)
+
+    class Operator(ScriptedPrompt):
+        def enter(self, question: str) -> None:  # to try again
+            arm.q = np.full(6, 0.2)
+
+    prompt = Operator()
+    touch = PointContact(PointSettings(kind="point"), InstrumentContext(lambda question: ""))
+    measuring(session, prompt, arm, touch).run()
+    assert [r.q[0] for r in session.accepted] == [0.1, 0.2]
+    assert "! found the joints of stop 1, expected another orientation" in prompt.shown
+
+
+def test_undo_takes_back_what_was_done_last_a_skip_too() -> None:
+    session, prompt = session_of(4), ScriptedPrompt("skip", "skip", "undo", "undo", "undo")
+    with pytest.raises(ScriptEnded):  # at stop 2, after stop 1 was measured twice
+        measuring(
+            session, prompt, ScriptedJoints(np.full(6, 0.1)), Tracker(manual=False)
+        ).run()  # fmt: skip
+    done = [line.strip() for line in prompt.shown if "after all" in line or "discarded" in line]
+    assert done == [
+        "to be measured after all: stop 3", "to be measured after all: stop 2",
+        "discarded the reading of stop 1",
+    ]  # fmt: skip
+    assert (session.remaining, session.undone) == (3, 1)
