@@ -50,13 +50,20 @@ def find_sessions(
     the file's name up to its first underscore. ``pattern`` is a regular expression that matches
     the arm in the path below the folder of the fleet instead (first group, or the whole match).
     The files ``without``, tables that a run reads or writes, are ignored, and so are those that
-    an earlier run has written.
+    an earlier run has written, and links to other logs of the fleet.
     Raises InputError if there is no log, or ``pattern`` does not match one.
     """
     found = {log for text in where for log in _logs(text)}
+    own = {os.path.realpath(log) for log in found if not log.is_symlink()}
     tables = {os.path.realpath(table) for table in without}
     logs = sorted(
-        (log for log in found if os.path.realpath(log) not in tables and not _is_table(log)),
+        (
+            log
+            for log in found
+            if (place := os.path.realpath(log)) not in tables
+            and not (log.is_symlink() and place in own)  # ``latest.csv`` would count twice
+            and not _is_table(log)
+        ),
         key=lambda p: natural_key(str(p)),
     )
     if not logs:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from datetime import datetime
@@ -163,8 +164,9 @@ def short_plan(
 
 
 def baseline_path(cell: Path) -> Path:
-    """Return the path of a calibrated cell's accuracy baseline."""
-    return cell.with_name(f"{cell.stem}.promise.json")
+    """Return the path of a cell's accuracy baseline; of a link, beside the file it leads to."""
+    place = Path(os.path.realpath(cell))
+    return place.with_name(f"{place.stem}.promise.json")
 
 
 def document_text(document: dict[str, Any]) -> str:

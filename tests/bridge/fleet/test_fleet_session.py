@@ -66,6 +66,14 @@ def test_a_glob_and_the_files_it_stands_for_come_to_the_same(tmp_path: Path) -> 
     assert arms_of(glob) == arms_of(listed) == {"a/s1": "a", "b/s1": "b"}
 
 
+def test_a_link_to_a_log_of_the_fleet_is_not_counted_again(tmp_path: Path) -> None:
+    files_in(tmp_path, "logs/a/s1.csv", "logs/a/s2.csv", "archive/s3.csv")
+    (tmp_path / "logs/a/latest.csv").symlink_to("s2.csv")
+    (tmp_path / "logs/a/s3.csv").symlink_to(tmp_path / "archive/s3.csv")
+    found = find_sessions([str(tmp_path / "logs")])
+    assert [s.name for s in found.sessions] == ["a/s1", "a/s2", "a/s3"]
+
+
 def test_a_pattern_finds_the_arm(tmp_path: Path) -> None:
     files_in(tmp_path, "hall1/line-a.csv", "hall2/line-a.csv")
     found = find_sessions([str(tmp_path)], r"(hall\d)/")

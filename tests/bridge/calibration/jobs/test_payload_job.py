@@ -127,6 +127,19 @@ def test_a_cell_that_could_not_be_loaded_is_not_written(job: PayloadJob, tmp_pat
     assert ended(job) == []
 
 
+def test_a_baseline_is_beside_the_cell_that_a_link_leads_to(
+    job: PayloadJob, tmp_path: Path
+) -> None:
+    real = tmp_path / "arms" / "arm7.yaml"
+    real.parent.mkdir()
+    real.write_text("", encoding="utf-8")
+    (tmp_path / "new.yaml").symlink_to(real)
+    job.write_new_cell(job.cell.model, "the cell", baseline={"kind": "position"})
+    assert json.loads((real.parent / "arm7.promise.json").read_text()) == {"kind": "position"}
+    assert load_cell(real).arm.n == 6
+    assert baseline_path(tmp_path / "new.yaml") == baseline_path(real)
+
+
 def test_a_cell_and_its_baseline_are_written_before_the_end_or_not_at_all(
     job: PayloadJob, tmp_path: Path
 ) -> None:
