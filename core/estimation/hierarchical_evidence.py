@@ -6,7 +6,7 @@ fleet's fit needs neither logs nor models (hierarchical.py).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
 MIN_POSES = 4  # with an instrument that is not registered
+MIN_REGISTERED = 2
 RANK = 1e-9  # singular values below this share of the largest are rounding
 
 
@@ -37,8 +38,8 @@ RANK = 1e-9  # singular values below this share of the largest are rounding
 class Evidence:
     """Equations ``matrix @ flexibilities = right``, each with the noise of one coordinate.
 
-    Flexibilities are axial 1..n, then radial 1..n. The instrument's frame and the tool point are
-    projected out.
+    Flexibilities are axial 1..n, then radial 1..n. The tool point, and the frame of an instrument
+    that is not registered, are projected out.
     """
 
     matrix: Array  # (2n, 2n) m per rad/Nm
@@ -59,11 +60,13 @@ def evidence(model: Model, log: Log, metrology: Metrology | None = None) -> Evid
     """
     metrology = metrology or Metrology()
     data, used = measured_rows(log, metrology.registered)
-    least = 1 if metrology.registered else MIN_POSES
+    least = MIN_REGISTERED if metrology.registered else MIN_POSES
     if len(used) < least:
         raise ExcitationError(
             f"found {len(used)} row(s) with measured poses, expected at least {least}"
         )
+    if metrology.registered:  # the tool may be bent all the same: its point alone is a nuisance
+        data = replace(data, session=np.zeros(len(used), dtype=np.int64), remounted=True)
     all_free = np.ones(2 * model.arm.n, dtype=bool)
     fit = fit_flexibilities(fit_nuisances(model, data), data, all_free, prior_of(model))
     return _reduced(fit, data, metrology)

@@ -73,7 +73,26 @@ def test_a_outlier_reading_is_set_aside() -> None:
 def test_a_session_of_too_few_poses_reports_nothing() -> None:
     with pytest.raises(ExcitationError, match=r"found 3 row\(s\).* expected at least 4"):
         evidence(NOMINAL, session(3, 0))
-    assert evidence(NOMINAL, session(1, 0), Metrology(registered=True)).poses == 1
+    registered = Metrology(registered=True)
+    with pytest.raises(ExcitationError, match=r"found 1 row\(s\).* expected at least 2"):
+        evidence(NOMINAL, session(1, 0), registered)
+    assert evidence(NOMINAL, session(2, 0), registered).poses == 2
+
+
+@pytest.mark.parametrize("rotation", [False, True])
+def test_a_bent_tool_leaves_the_equations_of_a_registered_cell_as_they_are(rotation: bool) -> None:
+    log = session(30, 0, rotation=rotation)
+    turn = rotation_matrix(np.array([[0.3, -0.2, 0.9]]))[0]  # back into base
+    log.columns["measured_position"] = (log.columns["measured_position"] - [1.0, 2.0, 0.5]) @ turn
+    if rotation:
+        axes = rotation_matrix(log.columns["measured_rotation"])
+        log.columns["measured_rotation"] = rotation_vector(turn.T @ axes)
+    bent = NOMINAL.tool_in_flange.copy()
+    bent[:3, 3] += [0.001, -0.0005, 0.002]
+    found = evidence(replace(NOMINAL, tool_in_flange=bent), log, Metrology(registered=True))
+    scale = np.abs(found.right).max()
+    assert np.abs(found.matrix @ TRUTH - found.right).max() < 1e-5 * scale
+    assert found.squares < 1e-10 * scale**2
 
 
 def reported(truth: Array, rng: Generator, rows: int = 6, gain: float = 1.0) -> Evidence:
