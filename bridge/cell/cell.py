@@ -89,19 +89,19 @@ class Cell:
     @property
     def recording(self) -> RecordingSettings:
         """Return section ``recording``, its folder made absolute."""
-        return self.file.recording.located(self.path.parent)
+        return self.file.recording.located(self.path.parent.resolve())
 
     @property
     def web(self) -> WebSettings | None:
         """Return section ``web``, its paths made absolute; None if the cell has none."""
         section = self.file.web
-        return None if section is None else section.located(self.path.parent)
+        return None if section is None else section.located(self.path.parent.resolve())
 
     @property
     def metrics(self) -> MetricsSettings | None:
         """Return section ``metrics``, its paths made absolute; None if the cell has none."""
         section = self.file.metrics
-        return None if section is None else section.located(self.path.parent)
+        return None if section is None else section.located(self.path.parent.resolve())
 
     @property
     def calibration(self) -> CalibrationSettings:

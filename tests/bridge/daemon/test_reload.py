@@ -182,6 +182,17 @@ def test_sections_of_running_processes_stay_and_each_reload_names_them(tmp_path:
         taking.running = new
 
 
+def test_an_unchanged_cell_that_was_given_by_a_relative_path_has_no_changed_section(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    taking = Taking(Path())
+    taking.reload.ask()
+    taking.step(State.OBSERVING)
+    (*_, event) = taking.reload._event_log.recent
+    assert event["detail"] == "the cell file was read again and is being taken"
+
+
 PATIENT = ", state_timeout: 0.25"
 
 
