@@ -11,6 +11,7 @@ from gapbridge.core.log.log_finding import LogCheck, LogFinding
 POSITIONS_OFF = "the measured positions do not follow the arm: {0:.0f mm} off in any frame; "
 ROTATIONS_OFF = "the measured rotations do not follow the arm: "
 PULL = "actual_TCP_force seems {}; expected what the surroundings do to the tool, in base axes"
+LAG = "{}_* seems to come about {{0:lag}} the joint angles; expected both on one clock"
 TEXTS = {
     LogCheck.MISSPELT: "a column was left out; found {0}; did you mean {1}?",
     LogCheck.CLOCKS_OVERLAP: "the sessions' timestamps overlap: each has its own clock, so the "
@@ -89,6 +90,8 @@ TEXTS = {
     "ways; expected torques with a sign, not their size (a hobby servo's current has none)",
     LogCheck.CURRENTS: "actual_current_as_torque is only {0:.2f} times what the links weigh at "
     "joints {1}: it looks like currents (A), expected torques (Nm)",
+    LogCheck.WRENCH_LAG: LAG.format("ft_raw_wrench"),
+    LogCheck.TORQUE_LAG: LAG.format("actual_current_as_torque"),
     LogCheck.GRAVITY: "the joint torques show weights that pull along {0:vector} m/s² of the base, "
     "the cell's gravity is {1:vector}: is the base mounted as the cell says?",
     LogCheck.MISSING_FLEXIBILITY: "position: the cell has no joint flexibility, which hides other "
@@ -147,6 +150,8 @@ class _Formatter(Formatter):
                 return ", ".join(f"joint {i} is column _{k}" for i, k in value)
             case "vector":
                 return f"[{', '.join(f'{x:.1f}' for x in value)}]"
+            case "lag":
+                return f"{abs(value):.2f} s {'after' if value > 0 else 'before'}"
             case "point":
                 return f"({', '.join(f'{1e3 * x:.0f}' for x in value)}) mm"
         if format_spec.endswith(" mm"):

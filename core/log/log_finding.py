@@ -64,6 +64,8 @@ class LogCheck(Enum):
     LEFT_HANDED_WRENCH = auto()  # axes of the flange that its three forces are along, with signs
     TORQUE_SIGN = auto()
     TORQUE_UNSIGNED = auto()
+    WRENCH_LAG = auto()  # how late (s), negative: early
+    TORQUE_LAG = auto()  # the same
     CURRENTS = auto()  # share of the weights, joints
     GRAVITY = auto()  # what the torques show, that of the cell (m/s², base axes)
     # the model
@@ -80,6 +82,7 @@ MISREAD = {
     LogCheck.WRENCH_SIGN: "wrench", LogCheck.TORQUES_FIRST: "wrench",
     LogCheck.LEFT_HANDED_WRENCH: "wrench", LogCheck.TORQUE_SIGN: "torque",
     LogCheck.TORQUE_UNSIGNED: "torque", LogCheck.CURRENTS: "torque",
+    LogCheck.WRENCH_LAG: "wrench", LogCheck.TORQUE_LAG: "torque",
     LogCheck.COMMAND_ORDER: "tracking",
 }  # fmt: skip
 """Channels whose readings are not what their column should hold."""

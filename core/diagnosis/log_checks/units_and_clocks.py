@@ -186,6 +186,7 @@ def findings(
     # imported here, because prediction only checks units
     from gapbridge.core.diagnosis.log_checks.commands import command_findings
     from gapbridge.core.diagnosis.log_checks.frames import frame_findings
+    from gapbridge.core.diagnosis.log_checks.lags import lag_findings
     from gapbridge.core.diagnosis.log_checks.signs import sign_findings
     from gapbridge.core.diagnosis.log_checks.weights import weight_findings
 
@@ -194,7 +195,7 @@ def findings(
         listed += frame_findings(model, log, metrology or Metrology())
     weights = weight_findings(model, log)
     signs = [s for s in sign_findings(model, log) if not weights or s.check != LogCheck.TORQUE_SIGN]
-    return listed + weights + signs
+    return listed + weights + signs + lag_findings(model, log)
 
 
 class ColumnsAndOrder:
