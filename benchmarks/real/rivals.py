@@ -24,8 +24,7 @@ MOST = 3000  # rows of a recording that are fitted
 
 def position_left(cell: dict[str, Any], fitted: Table, judged: Table) -> Array:
     """Return the vectors (N, 3) that the geometric least squares leave of judged positions."""
-    links, tool = links_of(cell), np.array(cell["tool"]["tcp"]["xyz"], dtype=float)
-    assert links is not None
+    links, tool = _rows_of(cell), np.array(cell["tool"]["tcp"]["xyz"], dtype=float)
     q, measured = fitted.joints(), _needed(fitted, "measured_position")
     step = max(1, len(q) // MOST)
     session = sessions(fitted)[::step]
@@ -60,8 +59,7 @@ def wrench_corrected(cell: dict[str, Any], fitted: Table, judged: Table) -> Tabl
 
 def _wrench_rows(cell: dict[str, Any], table: Table) -> Array:
     """Return d wrench / d (bias 6, mass, first moment 3), flat rows."""
-    links = links_of(cell)
-    assert links is not None
+    links = _rows_of(cell)
     _, R = arms.flange(links, table.joints())
     down = np.einsum("nji,j->ni", R, np.array(cell.get("gravity", [0, 0, -9.80665]), dtype=float))
     out = np.zeros((len(table), 6, 10))
@@ -189,6 +187,13 @@ def derivatives(table: Table) -> tuple[Array, Array, Array, int]:
 
 def _on(clock: Array, time: Array, values: Array) -> Array:
     return np.column_stack([np.interp(clock, time, v) for v in values.T])
+
+
+def _rows_of(cell: dict[str, Any]) -> tuple[arms.Link, ...]:
+    links = links_of(cell)
+    if links is None:
+        raise ValueError("cell: found a URDF, expected the arm as DH rows for least squares")
+    return links
 
 
 def _needed(table: Table, name: str) -> Array:
