@@ -144,6 +144,34 @@ M1013 = _links(
     (0, H, 0, 0, 2.82, (-0.0002, 0.0323, -0.0037)),
     (0, 0, 0.121, 0, 4.16, (0.0001, 0.0003, 0.1653)),
 )
+# FANUC R-2000iB/165F, product manual; its zero is the height of joint 2
+R2000 = _links(
+    (0.312, -H, 0),
+    (1.075, 0, 0, -H),
+    (0.225, -H, 0),
+    (0, H, 1.28),
+    (0, -H, 0),
+    (0, 0, 0.215),
+)
+# QKM HL6: the lengths of the data set
+QKM = _links(
+    (0, -H, 0.491),
+    (0.35, 0, 0, -H),
+    (0, -H, 0, -H),
+    (0, H, 0.35),
+    (0, -H, 0),
+    (0, 0, 0.084),
+)
+# Franka Emika Panda by rows, for least squares of positions
+PANDA = _links(
+    (0, -H, 0.333),
+    (0, H, 0),
+    (0.0825, H, 0.316),
+    (-0.0825, -H, 0),
+    (0, H, 0.384),
+    (0.088, H, 0),
+    (0, 0, 0.107),
+)
 # three axes in one point: every attitude of a flange, where a data set gives attitudes, no joints
 WRIST = _links((0, -H, 0), (0, H, 0), (0, 0, 0))
 

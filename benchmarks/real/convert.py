@@ -19,27 +19,24 @@ from typing import Any
 import click
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from benchmarks.real import arms
+from benchmarks.real import convert_more as more
+from benchmarks.real.converted import (
+    Array,
+    Columns,
+    Converted,
+    cell_of,
+    poses_of,
+    tool_of,
+    tracker_of,
+)
 from benchmarks.real.geometry import rough_tool, rough_turn
 from benchmarks.real.spreadsheet import read_sheet
 
-Array = NDArray[np.float64]
-Columns = dict[str, Array]
 GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])  # Nm/A of the UR10e, as published
-
-
-@dataclass(frozen=True)
-class Converted:
-    """One log with its cell, and what is known of both."""
-
-    columns: Columns
-    cell: dict[str, Any]
-    about: dict[str, Any]
-    urdf: str | None = None
 
 
 @dataclass(frozen=True)
@@ -55,19 +52,6 @@ class Source:
     def folder(self) -> str:
         """Return the name of the clone."""
         return self.clone or self.repository.partition("/")[2]
-
-
-def _cell(links: tuple[arms.Link, ...], **more: Any) -> dict[str, Any]:
-    return {"robot": {"dh": [link.document() for link in links]}} | more
-
-
-def _tracker(sigma: float) -> dict[str, Any]:
-    return {"registered": False, "sigma": sigma}
-
-
-def _tool(point: Array, turn: Array | None = None) -> dict[str, Any]:
-    rpy = [0, 0, 0] if turn is None else [float(x) for x in turn]
-    return {"tcp": {"xyz": [float(x) for x in point], "rpy": rpy}}
 
 
 # -- UR10e, currents ---------------------------------------------------------------------------
@@ -90,7 +74,7 @@ def _ur10e(name: str, first: int, last: int) -> Callable[[Path], Converted]:
             "file": str(path.relative_to(folder)), "rows": f"{first} to {last}: the motion",
             "payload": "none",
         }  # fmt: skip
-        return Converted(columns, _cell(arms.UR10E), about)
+        return Converted(columns, cell_of(arms.UR10E), about)
 
     return make
 
@@ -115,7 +99,7 @@ def _force_sensor(folder: Path) -> Converted:
         "timestamps": "not recorded: 10 s steps were put in",
         "payload": "a gripper of unknown mass: declared as none",
     }
-    return Converted(columns, _cell(arms.WRIST), about)
+    return Converted(columns, cell_of(arms.WRIST), about)
 
 
 # -- KUKA iiwa, laser tracker ------------------------------------------------------------------
@@ -163,7 +147,7 @@ def _iiwa_log(raw: Array, mass: Array, about: dict[str, Any], more: Columns) -> 
         "timestamps": "only the order is known: 30 s steps were put in",
         "tool": "point and turn are the best for the nominal arm, rounded to 1 mm and 0.01 rad",
     } | about  # fmt: skip
-    cell = _cell(arms.IIWA7, tool=_tool(point, turn), metrology=_tracker(2e-5))
+    cell = cell_of(arms.IIWA7, tool=tool_of(point, turn), metrology=tracker_of(2e-5))
     return Converted(columns, cell, about)
 
 
@@ -186,11 +170,11 @@ def _motoman(name: str, tool: tuple[float, float, float] | None) -> Callable[[Pa
         point = np.array(tool) if tool else rough_tool(arms.MA1400, q, position)
         torso = (arms.Link(0, 15 * np.pi / 180, -0.263, -np.pi / 2),)
         down = arms.flange(torso, np.zeros((1, 1)))[1][0].T @ [0, 0, -9.80665]
-        cell = _cell(
+        cell = cell_of(
             arms.MA1400,
-            tool=_tool(point),
+            tool=tool_of(point),
             gravity=[float(x) for x in down],
-            metrology=_tracker(1e-5),
+            metrology=tracker_of(1e-5),
         )
         about = {
             "robot": "Yaskawa Motoman MA1400, right arm of a pair on one torso", "file": name,
@@ -221,7 +205,7 @@ def _irb120(folder: Path) -> Converted:
         "tool": "the tool point is the best for the nominal arm, rounded to 1 mm",
     }  # fmt: skip
     columns = {"timestamp": np.arange(len(q)) * 30.0, "actual_q": q, "measured_position": position}
-    cell = _cell(arms.IRB120, tool=_tool(point), metrology=_tracker(3e-5))
+    cell = cell_of(arms.IRB120, tool=tool_of(point), metrology=tracker_of(3e-5))
     return Converted(columns, cell, about)
 
 
@@ -247,31 +231,13 @@ def _ur10(name: str) -> Callable[[Path], Converted]:
             "actual_q": q,
             "measured_position": position,
         }
-        cell = _cell(arms.UR10, tool=_tool(np.array([0, 0, 0.109])), metrology=_tracker(2e-5))
+        cell = cell_of(arms.UR10, tool=tool_of(np.array([0, 0, 0.109])), metrology=tracker_of(2e-5))
         return Converted(columns, cell, about)
 
     return make
 
 
 # -- Staubli TX2-90L, IRB 120 again, Rokae: laser trackers ---------------------------------------
-
-
-def _poses(
-    links: tuple[arms.Link, ...], q: Array, position: Array, sigma: float, about: dict[str, Any],
-    point: Array | None = None, session: Array | None = None,
-) -> Converted:  # fmt: skip
-    """Return a log of measured poses; without a tool point the best for the nominal arm."""
-    if point is None:
-        first = slice(None) if session is None else session == session[0]
-        point = rough_tool(links, q[first], position[first])
-        about = about | {"tool": "the tool point is the best for the nominal arm, rounded to 1 mm"}
-    columns = {"timestamp": np.arange(len(q)) * 30.0, "actual_q": q, "measured_position": position}
-    columns |= {} if session is None else {"session": session}
-    about = about | {
-        "masses": "not known, left out",
-        "timestamps": "only the order is known: 30 s steps were put in",
-    }
-    return Converted(columns, _cell(links, tool=_tool(point), metrology=_tracker(sigma)), about)
 
 
 def _staubli(task: str) -> Callable[[Path], Converted]:
@@ -286,7 +252,7 @@ def _staubli(task: str) -> Callable[[Path], Converted]:
             "tool": "the point is the best for the nominal arm in the 40 poses for calibration, "
             "rounded to 1 mm",
         }  # fmt: skip
-        return _poses(arms.TX2_90L, q, position, 1e-5, about, point)
+        return poses_of(arms.TX2_90L, q, position, 1e-5, about, point)
 
     return make
 
@@ -317,7 +283,7 @@ def _irb120_position_only(folder: Path) -> Converted:
     }
     session = np.repeat([0.0, 1.0, 2.0], [len(q) for q, _ in parts])
     q, position = (np.vstack([part[k] for part in parts]) for k in (0, 1))
-    return _poses(arms.IRB120, np.deg2rad(q), position * 1e-3, 3e-5, about, session=session)
+    return poses_of(arms.IRB120, np.deg2rad(q), position * 1e-3, 3e-5, about, session=session)
 
 
 def _rokae(folder: Path) -> Converted:
@@ -327,7 +293,7 @@ def _rokae(folder: Path) -> Converted:
     lines = (folder / "data/laser_pos.csv").read_text(encoding="utf-8").splitlines()
     measured = np.array([line.split()[7:10] for line in lines if line.strip()], dtype=float)
     about = {"robot": "Rokae, six axes", "instrument": "laser tracker; the measured columns"}
-    return _poses(arms.ROKAE, q, measured * 1e-3, 2e-5, about)
+    return poses_of(arms.ROKAE, q, measured * 1e-3, 2e-5, about)
 
 
 # -- Panda, torques and tracking ---------------------------------------------------------------
@@ -413,7 +379,7 @@ def _kr300(name: str) -> Callable[[Path], Converted]:
             "model": "masses and centres of gravity of the data set's own model; its hydraulic "
             "counterbalance of joint 2 is in no model here",
         }  # fmt: skip
-        return Converted(columns, _cell(arms.KR300, gravity=[0, 0, 9.80665]), about)
+        return Converted(columns, cell_of(arms.KR300, gravity=[0, 0, 9.80665]), about)
 
     return make
 
@@ -454,7 +420,7 @@ def _meca500(*names: str) -> Callable[[Path], Converted]:
             "robot": "Mecademic Meca500", "files": ", ".join(names),
             "instrument": "laser tracker, by its resolution: not named; means of three readings",
         }  # fmt: skip
-        return _poses(arms.MECA500, np.deg2rad(raw[begins, :6]), position, 1e-5, about)
+        return poses_of(arms.MECA500, np.deg2rad(raw[begins, :6]), position, 1e-5, about)
 
     return make
 
@@ -481,7 +447,7 @@ def _aubo(name: str, joints: str = "CAL", columns: int = 0) -> Callable[[Path], 
         columns_of_log = {
             "timestamp": np.arange(len(q)) * 30.0, "actual_q": q, "measured_position": position,
         }  # fmt: skip
-        cell = _cell(arms.AUBO_I5, tool=_tool(point), metrology=_tracker(2e-5))
+        cell = cell_of(arms.AUBO_I5, tool=tool_of(point), metrology=tracker_of(2e-5))
         return Converted(columns_of_log, cell, about)
 
     return make
@@ -501,7 +467,7 @@ def _aubo_torques(number: int) -> Callable[[Path], Converted]:
             "robot": "AUBO i5", "instrument": "motor currents as torques, 200 Hz, means of the "
             "periods of an exciting motion of 10 s",
         }  # fmt: skip
-        return Converted(columns, _cell(arms.AUBO_I5), about)
+        return Converted(columns, cell_of(arms.AUBO_I5), about)
 
     return make
 
@@ -530,9 +496,9 @@ def _m1013(height: float, *names: str) -> Callable[[Path], Converted]:
             "the column bends under the arm, and has play where it is high",
             "instrument": "total station, 0.75 mm", "files": ", ".join(names),
         }  # fmt: skip
-        cell = _cell(
-            arms.M1013, tool=_tool(np.array([-0.10091, -0.00102, 0.33566])),
-            gravity=[0.0, -9.80665, 0.0], metrology=_tracker(7.5e-4),
+        cell = cell_of(
+            arms.M1013, tool=tool_of(np.array([-0.10091, -0.00102, 0.33566])),
+            gravity=[0.0, -9.80665, 0.0], metrology=tracker_of(7.5e-4),
         )  # fmt: skip
         return Converted(columns, cell, about)
 
@@ -619,6 +585,10 @@ MECA500_SET = ("hanbyeolyoonucla/robot-calibration", "33d50d777f1e182ddefb2774b0
 AUBO_SET = ("ziyiyuan/MyRobot", "d49fbc03d1364436c826ac87de8a114fa9dd189f")
 M1013_SET = ("Hilti-Research/construction_robot_stationing_datasets",
              "f26546d2f8fc8cf2adf619ffff69505126b0794e")  # fmt: skip
+XMATE_SET = ("NKU-ZiXuan/xMate7p_dyn_ident", "7d8c9246adfc2a14d161df41a21a70671471ac1c")
+LWR4_SET = ("kjyv/FloBaRoID", "e6c077ea5c09bceb49840f49e83450bb5979029b")
+GEN3_SET = ("wissem01chiha/dynamic-identification", "90ba37d676d8da6c064d9edf5c1a09389309752e")
+FT_SET = ("AndreFug/AIS2202-Modul2", "1b73c0cacb0fd34853648b8057ed708cab5e788c")
 SO101_SET = ("isaac-sim2real/sage", "4ffd2627df9d23e279b35712a67e629ce0c0dfa7")
 SOURCES: dict[str, Source] = {
     "ur10e_12harmonics": Source(*UR10E_SET, _ur10e("ur-20_02_10-30sec_12harm.csv", 635, 3510)),
@@ -684,6 +654,20 @@ SOURCES: dict[str, Source] = {
     "ar5": Source(
         "FrankJIE09/Dynamics_identification_Frank",
         "758dc8d6f78e63ecba0aac16d28255ae045f1d3c", _ar5),
+    "fanuc_circles": Source(
+        "RABKKK/LaserTrackerPoseData4KinIdent",
+        "e143dda2bf5280359912ed7618f2b63d7e262b58", more.fanuc),
+    "qkm": Source(
+        "Alcatrazee/Robot_calibration", "e15794b38dcc2cc907ca04c69dd692d3ab273329", more.qkm),
+    "panda_camera": Source(
+        "PhilNad/robot-arm-kinematic-calibration",
+        "6e0292a27caedfd3a205502115d243868fafc00d", more.panda_camera),
+    "ft_poses": Source(*FT_SET, more.ft_poses),
+    "ft_motion": Source(*FT_SET, more.ft_motion("1-baseline")),
+    "ft_vibrations": Source(*FT_SET, more.ft_motion("2-vibrations")),
+    **{f"xmate_{k}": Source(*XMATE_SET, more.xmate(k)) for k in (1, 2, 3)},
+    **{f"lwr4_{k}": Source(*LWR4_SET, more.lwr4(k)) for k in (1, 2, 3)},
+    **{f"gen3_{k}": Source(*GEN3_SET, more.gen3(f"opti_traj_testing{k}")) for k in (1, 2)},
     **{f"so101_{name}": Source(*SO101_SET, _so101(name)) for name in (
         "multisine", "random_waypoints", "large_amplitude", "backlash_detection")},
 }  # fmt: skip

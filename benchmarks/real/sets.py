@@ -50,5 +50,6 @@ CARRIED = (
 REMOUNTED = {
     "iiwa_three_loads",
     "irb120_position_only",
+    "qkm",
 }  # logs whose sessions have a tool point of their own
 """Sets whose sessions were measured with the tool mounted anew."""
