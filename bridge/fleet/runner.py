@@ -15,7 +15,7 @@ from gapbridge.bridge.document.output_file import printable
 from gapbridge.bridge.document.provenance import installed_version
 from gapbridge.bridge.fleet.cell_source import CellSource
 from gapbridge.bridge.fleet.journal import Journal
-from gapbridge.bridge.fleet.session import Fleet, Session, natural_key
+from gapbridge.bridge.fleet.session import Fleet, Session, copies, natural_key
 from gapbridge.bridge.fleet.task import BAD, CRASHED, DIED, DONE, Outcome, SessionJob, Stamp, Task
 from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.bridge.report.labels import counted
@@ -42,10 +42,12 @@ def make_tasks(
     """Return the tasks, and the outcomes of sessions without a usable cell or log."""
     tasks, bad = [], []
     stamps: dict[Path, tuple[Stamp, ...]] = {}
-    version = installed_version()
+    version, copied = installed_version(), copies(sessions)
     for session in sessions:
         task = Task("", session.arm, session.name, session.log, Path(), job, options)
         try:
+            if (other := copied.get(session.log)) is not None:
+                raise InputError(f"{session.log}: found a copy of {other}, expected each log once")
             cell = cells.cell_of(session)
             for path in (session.log, cell):  # as the tables of results hold them
                 require_utf8(path)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from gapbridge.bridge.document.provenance import digest
 from gapbridge.core.errors import InputError
 from gapbridge.core.log.columns import PARQUET
 
@@ -78,6 +79,21 @@ def find_sessions(
     _require_unique(sessions)
     rule = f"pattern {pattern!r}" if pattern else _rule(sessions)
     return Fleet(folder, tuple(sessions), rule)
+
+
+def copies(sessions: Sequence[Session]) -> dict[Path, Path]:
+    """Return the logs that hold the same bytes as an earlier one, with that one."""
+    by_size: dict[int, list[Path]] = {}
+    for session in sessions:
+        if session.log.is_file():
+            by_size.setdefault(session.log.stat().st_size, []).append(session.log)
+    first: dict[str, Path] = {}
+    copied = {}
+    for log in (log for size, logs in by_size.items() if size and len(logs) > 1 for log in logs):
+        content = digest(log)
+        if content is not None and (other := first.setdefault(content, log)) != log:
+            copied[log] = other
+    return copied
 
 
 def natural_key(text: str) -> list[tuple[int, int, str]]:

@@ -110,6 +110,18 @@ def test_tables_of_an_earlier_run_are_no_logs_of_the_next(tmp_path: Path) -> Non
         assert list(arms_of(find_sessions([str(tmp_path)]))) == ["a/s"]
 
 
+def test_a_copy_of_another_arms_log_is_skipped(tmp_path: Path) -> None:
+    for name, text in (("arm1/s", "a"), ("arm2/s", "b"), ("arm10/s", "a")):
+        files_in(tmp_path / "logs", f"{name}.csv")
+        (tmp_path / "logs" / f"{name}.csv").write_text(text, encoding="utf-8")
+    (tmp_path / "cell.yaml").write_text("robot: {model: ur10e}\n", encoding="utf-8")
+    sessions = find_sessions([str(tmp_path / "logs")]).sessions
+    tasks, [bad] = make_tasks(sessions, OneCell(tmp_path / "cell.yaml"), count_rows, {})
+    assert [task.arm for task in tasks] == ["arm1", "arm2"]
+    assert (bad.arm, bad.state) == ("arm10", BAD)
+    assert bad.error.endswith("arm1/s.csv, expected each log once")
+
+
 def test_a_log_whose_name_is_not_utf8_is_skipped(tmp_path: Path) -> None:
     files_in(tmp_path, os.fsdecode(b"a/s\xff.csv"), "a/t.csv", "cell.yaml")
     sessions = find_sessions([str(tmp_path / "a")]).sessions
