@@ -32,6 +32,7 @@ MAX_NOISE = (
     10.0,
     1.0,
 )  # N, Nm, 1 sigma of a reading about load and bias: no sensor at rest has more
+MIN_CHANGE = (0.5, 0.05)  # N, Nm from pose to pose, that no axis of a sensor overlooks
 NOISE_SHARE = 0.1  # the same of the readings' change from pose to pose, for heavy loads
 
 
@@ -101,6 +102,7 @@ def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibrati
     flat, value = columns.reshape(-1, 10), wrench.reshape(-1)
     unit = np.tile(np.repeat([0, 1], 3), len(q))  # separate noise of forces and torques
     fit = robust_fit(flat, value, unit, row=np.repeat(np.arange(len(q)), 6))
+    _require_live(wrench, (flat @ fit.values).reshape(-1, 6))
     _require_consistent(wrench, fit.noise)
     covariance, cog = _in_terms_of_cog(fit.values, fit.covariance)
     mass = float(fit.values[0])
@@ -130,6 +132,19 @@ def _check_shapes(model: Model, q: Array, wrench: Array) -> None:
         raise ExcitationError(
             f"payload session: found {len(q)} reading(s), expected {MIN_READINGS} or more "
             "orientations"
+        )
+
+
+def _require_live(wrench: Array, predicted: Array) -> None:
+    """Raise InputError for an axis that never changes though the load found makes it change."""
+    still = np.ptp(wrench, axis=0) < 1e-9 * (1.0 + np.abs(wrench[0]))
+    change = np.ptp(predicted, axis=0)
+    dead = np.flatnonzero(still & (change > np.repeat(MIN_CHANGE, 3)))
+    if len(dead):
+        axis, unit = AXES[dead[0]], ("N", "Nm")[dead[0] // 3]
+        raise InputError(
+            f"payload session: found the same {axis} in every orientation, expected it to change "
+            f"by {change[dead[0]]:.2g} {unit} with the load on the other axes: is it connected?"
         )
 
 

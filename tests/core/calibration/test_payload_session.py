@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.blind.arms import ARMS
 from benchmarks.blind.mechanics import stand
 from benchmarks.calibration.drawings import model_of, real_arm, session_at
-from gapbridge.core.calibration.payload_session import calibrate_payload, weight_columns
+from gapbridge.core.calibration.payload_session import AXES, calibrate_payload, weight_columns
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.model import Model
@@ -146,6 +146,24 @@ def test_a_sensor_that_is_dead_or_has_other_axes_is_not_taken_for_a_bare_flange(
     rotation = load.predict(q).rotation @ load.chain().tool_rotation.T
     with pytest.raises(InputError, match=match):
         calibrate_payload(load, q, fault(weight + 0.01 * rng.normal(size=(8, 6)), rotation))
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_an_axis_of_the_sensor_that_never_changes_is_named(model: Model, axis: int) -> None:
+    rng = np.random.default_rng(8)
+    q = rng.uniform(KIND.low, KIND.high, (8, 6))
+    wrench = weight_columns(model, q)[:, :, :4] @ np.array([3.0, 0.15, -0.12, 0.15])
+    wrench += 0.01 * rng.normal(size=(8, 6))
+    wrench[:, axis] = 0.3
+    with pytest.raises(InputError, match=f"the same {AXES[axis]} in every orientation"):
+        calibrate_payload(model, q, wrench)
+
+
+def test_an_axis_that_the_load_does_not_change_may_be_constant(model: Model) -> None:
+    q = np.random.default_rng(8).uniform(KIND.low, KIND.high, (8, 6))
+    wrench = weight_columns(model, q) @ np.array([3.0, 0, 0, 0.15, 1, 2, 3, 0.1, 0.2, 0.3])
+    assert np.ptp(wrench[:, 5]) < 1e-12
+    assert calibrate_payload(model, q, wrench).mass == pytest.approx(3.0)
 
 
 def test_planned_orientations_hit_no_obstacle_and_keep_to_the_joint_range(model: Model) -> None:
