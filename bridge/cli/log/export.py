@@ -50,6 +50,7 @@ def export_recording(
     _emit(out, export(recording, out, span))
     if cell_out is not None:
         write_text(cell_out, str(read_configuration(recording).get("text", "")))
+        click.echo(f"{cell_out}: written")
 
 
 def _moment(option: str, text: str | None) -> float | datetime | None:

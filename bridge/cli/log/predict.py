@@ -113,8 +113,8 @@ class _Summary:
             worst, line = self._worst
             median = np.median(np.concatenate(self._std))
             yield (
-                f"standard deviation of the position (3D, the fit's part): {median:.4f} mm in "
-                f"the middle, at most {worst:.4f} mm (row {line})"
+                f"standard deviation of the position (3D, the fit's part): median "
+                f"{median:.4f} mm, at most {worst:.4f} mm (row {line})"
             )
         if self._count:
             rows = ", ".join(map(str, self._outside)) + (", ..." if self._count > MAX_SHOWN else "")

@@ -232,6 +232,7 @@ def test_the_command_writes_beside_the_recording_and_gives_the_cell_back(
     cell = tmp_path / "cell.yaml"
     done = runner.invoke(gapbridge, ["export", str(desk.files[1]), "--cell-out", str(cell)])
     assert cell.read_text() == "robot: {model: ur10e}\n"
+    assert done.output.endswith(f"{cell}: written\n")
     same = str(tmp_path / "same.csv")
     done = runner.invoke(
         gapbridge, ["export", str(desk.files[1]), "--out", same, "--cell-out", same]
