@@ -19,7 +19,7 @@ VERDICTS = {
     Verdict.NO_GAP: "No gap",
     Verdict.EXPLAINED: "Explained",
     Verdict.PARTLY_EXPLAINED: "Partly explained",
-    Verdict.UNEXPLAINED: "Not explained",
+    Verdict.UNEXPLAINED: "Unexplained",
 }
 DEGREES = ("deg", 180 / math.pi)
 _QUANTITIES: dict[str, tuple[str, str, float]] = {  # of a column: title, unit, factor from SI
