@@ -120,10 +120,13 @@ def search_and_refit(
     chosen = [searched.term_index[p] for p in judgement.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
     selection = searched
-    if streamed or len(whole.rows) > len(observation.rows):
+    more_rows = streamed or len(whole.rows) > len(observation.rows)
+    if more_rows:
+        judgement = with_undecided_terms(judgement)
+    # the links' effects were judged together, where the position's geometry is one effect
+    if more_rows or (searched.block and observation.channel != "position"):
         if progress:
             progress(f"{observation.channel}: all {len(whole.rows)} rows")
-        judgement = with_undecided_terms(judgement)
         selection = fitted_on_all_rows(searched, judgement, whole, model)
 
     def depends(accused: Sequence[int]) -> Depends:

@@ -11,6 +11,7 @@ import pytest
 from further import further
 
 from gapbridge.core import dynamics
+from gapbridge.core.diagnosis import diagnosis as diagnosing
 from gapbridge.core.diagnosis.channels.recording import STRETCHES
 from gapbridge.core.diagnosis.channels.torque import observe
 from gapbridge.core.diagnosis.diagnosis import diagnose
@@ -158,6 +159,28 @@ def test_an_outside_pull_is_no_gap(plant):
     log = truth.log_of(N, actual_q=q, actual_current_as_torque=torque, actual_TCP_force=pull)
     seen = observe(plant.model(2.0), log, METROLOGY)
     assert np.abs(seen.measured - seen.predict(())).max() < 1e-8
+
+
+def test_effects_of_a_short_recording_have_to_gain_by_themselves_too(plant, recorded, monkeypatch):
+    """Of up to 300 samples, all searched, first moments came with what the friction gained."""
+    judged = []
+
+    def accused(selection, judgement, *rest):
+        judged.append(judgement.accused)
+        return kept(selection, judgement, *rest)
+
+    kept = diagnosing.accused_on_all_rows
+    monkeypatch.setattr(diagnosing, "accused_on_all_rows", accused)
+    wrong = plant.model(2.0).with_terms(
+        [Term("link_cog", Site(j), (0.4, -0.3, 0.2)) for j in (2, 3, 4)]
+    )
+    torque = recorded[-1] + FRICTION * (np.sign(recorded[2]) + recorded[2])
+    log = log_of(recorded, torque).select(slice(0, 5000, 20))
+    (channel,) = diagnose(wrong, log).channels
+    assert channel.samples <= 300
+    assert [len(names) > 0 for names in judged] == [True]
+    assert "coulomb_friction" in {cause.effect for cause in channel.causes}
+    assert all(cause.shrink.interval[0] > 0 for cause in channel.causes)
 
 
 def test_rows_at_a_reversal_are_left_out(plant, recorded):
