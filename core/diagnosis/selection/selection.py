@@ -16,6 +16,7 @@ from gapbridge.core.diagnosis.criteria import (
     MAX_EXCESS_WITH_UNNAMED,
     MIN_SIGMAS,
     MIN_SIGMAS_WITH_UNNAMED,
+    NEGLIGIBLE_WORTH,
     PRIOR_REACH,
     UNDETERMINED_SPREAD,
 )
@@ -30,7 +31,7 @@ from gapbridge.core.diagnosis.selection.geometry import (
 )
 from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.noise import Noise
-from gapbridge.core.diagnosis.selection.refit import UnnamedPart, refit
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart, refit, worth
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows, flat
 from gapbridge.core.effects import Term
@@ -78,9 +79,13 @@ class Selection:
         """Return the positions of terms that have to be significant.
 
         Not those of the links' geometry as a whole, which is judged by its gain in regions that
-        were not fitted.
+        were not fitted; unless nothing of it is left. (Of positions in another order all numbers
+        were held nominal, and a cause of zeros remained.)
         """
-        return [p for p in positions if not self.is_link(p)]
+        links = [p for p in positions if self.is_link(p)]
+        if any(worth(self.terms[p], self.covariance[p]) > NEGLIGIBLE_WORTH for p in links):
+            return [p for p in positions if p not in links]
+        return list(positions)
 
     def is_link(self, position: int) -> bool:
         """Return whether a term is a link's geometry, where all links are a cause."""

@@ -301,6 +301,18 @@ def test_all_links_stay_a_cause_of_which_no_single_number_is_significant(monkeyp
     assert significant_alone(found, given, GAINING, None) == (found, given)
 
 
+@pytest.mark.parametrize(("value", "alone"), [(2e-4, [0]), (0.0, [0, 1, 2])])
+def test_links_of_which_nothing_is_left_are_no_cause(value, alone):
+    """30 % of a tracker's positions in another order: all numbers of the links held nominal."""
+    terms = [
+        Term("joint_offset", Site(1), (1.0,)),
+        *(Term("link_geometry", Site(j), (0.0, value, 0.0)) for j in (2, 3)),
+    ]
+    covariance = [np.eye(1) * 1e-4, *[np.diag([0.0, 1e-8, 0.0])] * 2]
+    found = SimpleNamespace(terms=terms, covariance=covariance, is_link=lambda p: p > 0)
+    assert Selection.judged_alone(found, (0, 1, 2)) == alone
+
+
 @pytest.mark.parametrize(
     ("lengths", "deviation", "nominal"),
     [
