@@ -121,7 +121,7 @@ def slip_text(slip: Slip) -> str:
 def between_text(slip: Slip) -> str:
     """Return the last row before a slip and the first row after it."""
     if not slip.timed:
-        return f"rows {slip.before:g} and {slip.after:g} of the log"
+        return f"rows {slip.before:g} and {slip.after:g} of the log, counted without its header"
     start = "" if is_date(slip.first) else " from the start"
     return f"{moment_text(slip, slip.before)} and {moment_text(slip, slip.after)}{start}"
 
