@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.real.convert CHECKOUTS --out DIR``: CHECKOUTS holds clones of the sources
 under their own names (``git clone https://github.com/OWNER/NAME``; hanbyeolyoonucla's, a second
-``robot-calibration``, as ``meca500``); what is not there is skipped.
+``robot-calibration``, as ``meca500``); what is not there is skipped. Later commits of FloBaRoID
+and dynamic-identification lack their data: these two at the commits of ``SOURCES``.
 None of these sets is part of this repository.
 """
 

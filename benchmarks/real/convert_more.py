@@ -182,7 +182,8 @@ def gen3(name: str) -> Callable[[Path], Converted]:
         place = folder / "pyDynaMapp"
         raw = np.genfromtxt(place / f"data/kinova/validation_data/{name}.csv", delimiter=",",
                             skip_header=1)  # fmt: skip
-        raw = raw[(np.abs(np.nan_to_num(raw[:, 1:57], nan=np.inf)) < 1e3).all(axis=1)]
+        wrong = ~(np.abs(raw[:, 1:57]) < 1e3).all(axis=1) | ~raw[:, 50:57].any(axis=1)
+        raw = raw[: int(np.argmax(wrong)) if wrong.any() else len(raw)]
         columns = {
             "timestamp": raw[:, 0] * 1e-3, "target_q": raw[:, 50:57], "actual_q": raw[:, 1:8],
             "actual_qd": raw[:, 8:15], "actual_current_as_torque": raw[:, 22:29],
@@ -190,7 +191,7 @@ def gen3(name: str) -> Callable[[Path], Converted]:
         }  # fmt: skip
         about = {
             "robot": "Kinova Gen3, seven axes", "instrument": "its own torque sensors, 1 kHz",
-            "rows": "those of finite numbers below 1000", "model": "the data set's own URDF",
+            "rows": "those before its commands end", "model": "the data set's own URDF",
         }  # fmt: skip
         urdf = (place / "robot/kinova/gen3.urdf").read_text(encoding="utf-8")
         return Converted(columns, {"robot": {"urdf": "robot.urdf"}}, about, urdf)
