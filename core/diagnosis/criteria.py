@@ -123,5 +123,5 @@ MAX_SHARE_AFTER_CORRECTION = 0.1  # of the distance that may remain for a mistak
 MAX_RATIO_TO_BEST = 0.8  # to the best mistake so far, for another to replace it
 MAX_SHARE_WITH_OTHER_SIGN = 0.5  # of the residual, for a force's sign to be reported as wrong
 MAX_SHARE_WITH_LAG = 0.85  # of the residual, for readings to be reported as late or early: in 14
-# real torque logs the best lag beyond 0.05 s leaves at least 0.92; moved by 0.1 s, 0.23 to 0.84 in
-# 20 of 28 (a KR 300's slow motion, mostly friction, does not show it)
+# real torque logs the best lag beyond 0.05 s leaves at least 0.92; moved by 0.1 s, 0.23 to 0.83 in
+# 21 of 28 (a KR 300's slow motion, mostly friction, does not show it)
