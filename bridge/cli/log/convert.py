@@ -67,6 +67,9 @@ def convert(source: Path, out: Path, cell: Path | None, **options: Any) -> None:
         known = "; ".join(one.title for one in SOURCES)
         plain = source.name.lower().endswith((".csv", ".csv.gz", *PARQUET))
         also = "; a file with columns such as actual_q_0 is a log as it stands" if plain else ""
+        bags = sorted(source.glob("*.db3")) + sorted(source.glob("*.mcap"))
+        if bags:
+            also = f"; without metadata.yaml give the bag's file itself, {bags[0].name}"
         raise LogError(
             f"{source}: found no known kind of recording, expected one of: {known}{also}"
         )

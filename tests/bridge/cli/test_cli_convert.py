@@ -64,6 +64,7 @@ def test_predictions_under_a_parquet_name_are_parquet(recording: Path) -> None:
     [
         (["nowhere.bag", "--out", "log.csv"], "nowhere.bag: not found"),
         (["cell.yaml", "--out", "log.csv"], "found no known kind of recording"),
+        (["bags", "--out", "log.csv"], "give the bag's file itself, run_0.db3"),
         (["plain.csv", "--out", "log.csv"], "actual_q_0 is a log as it stands"),
         (["robot.csv", "--out", "log.txt"], "expected .csv or .parquet"),
         (["robot.csv", "--out", "log.csv", "--topic", "joint=x"], "--topic: found 'joint=x'"),
@@ -84,6 +85,8 @@ def test_what_cannot_be_converted_is_one_line(
     dataset = recording.parent / "data" / "meta" / "info.json"
     dataset.parent.mkdir(parents=True)
     dataset.write_text("{}")
+    (recording.parent / "bags").mkdir()
+    (recording.parent / "bags" / "run_0.db3").touch()
     with contextlib.chdir(recording.parent):
         done = gapbridge("convert", *arguments)
     assert done.code == 2
