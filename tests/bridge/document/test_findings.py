@@ -75,7 +75,7 @@ def test_a_value_that_is_not_constant_names_the_quantity() -> None:
          "and 2023-11-14 22:14:00; before and after it nothing else changed"),
         (slipped(42, 43, timed=False, alone=False),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between rows 42 and 43 of "
-         "the log; whether anything else changed is open"),
+         "the log, counted without its header; whether anything else changed is open"),
         (slipped(42, 43, others=1, session="b.csv"),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg); b.csv is the first session "
          "that has it; besides the slips nothing else changed"),

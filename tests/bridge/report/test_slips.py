@@ -93,7 +93,7 @@ def answer_of(case: Case) -> list[str]:
     ("target", [r"The target on the tool moved by 2\.(2[89]|3) mm between 01:46:30 and 01:48:20; "
                 r"before and after it nothing else changed\."]),
     ("untimed", [r"The zero of joint 2 moved by \S+ mrad \(\S+ deg\) between rows 30 and 31 of the "
-                 r"log; before and after it nothing else changed\."]),
+                 r"log, counted without its header; before and after it nothing else changed\."]),
     ("uptime", [r"The target on the tool moved by \S+ mm between 3190 s and 3300 s from the start; "
                 r"before and after it nothing else changed\."]),
     ("two", [r"The zero of joint 2 moved by \S+ mrad \(\S+ deg\) between 01:46:30 and 01:48:20; "

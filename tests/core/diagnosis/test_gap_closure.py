@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import small_arm as small
 
-from gapbridge.core.diagnosis import diagnosis, value_stability
+from gapbridge.core.diagnosis import channel_search, value_stability
 from gapbridge.core.diagnosis.causes import Considered, Outcome
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
@@ -104,9 +104,9 @@ def two_searches(monkeypatch):
             "closes_gap": lambda found, accused: closes,
             "considered_of": lambda *_: (line, other),
         }.items():  # fmt: skip
-            monkeypatch.setattr(diagnosis, name, value)
+            monkeypatch.setattr(channel_search, name, value)
         model = SimpleNamespace(arm=None)
-        found, judgement, withdrawn = diagnosis._search(
+        found, judgement, withdrawn = channel_search._search(
             SimpleNamespace(channel=channel), model, (), None
         )
         return found.terms[0].effect, judgement.accused, [c.effect for c in withdrawn]

@@ -11,7 +11,7 @@ import pytest
 from further import further
 
 from gapbridge.core import dynamics
-from gapbridge.core.diagnosis import diagnosis as diagnosing
+from gapbridge.core.diagnosis import channel_search
 from gapbridge.core.diagnosis.channels.recording import STRETCHES
 from gapbridge.core.diagnosis.channels.torque import observe
 from gapbridge.core.diagnosis.diagnosis import diagnose
@@ -169,8 +169,8 @@ def test_effects_of_a_short_recording_have_to_gain_by_themselves_too(plant, reco
         judged.append(judgement.accused)
         return kept(selection, judgement, *rest)
 
-    kept = diagnosing.accused_on_all_rows
-    monkeypatch.setattr(diagnosing, "accused_on_all_rows", accused)
+    kept = channel_search.accused_on_all_rows
+    monkeypatch.setattr(channel_search, "accused_on_all_rows", accused)
     wrong = plant.model(2.0).with_terms(
         [Term("link_cog", Site(j), (0.4, -0.3, 0.2)) for j in (2, 3, 4)]
     )
