@@ -38,6 +38,7 @@ MIN_TEMPERATURE, MAX_TEMPERATURE = (-60.0, -20.0), (150.0, 60.0)  # °C: error, 
 COMPLIANCE_ERROR, COMPLIANCE_WARNING = 1.0, 0.01  # rad/Nm, of one joint
 CALIBRATION_ERROR, CALIBRATION_WARNING = 0.1, 0.02  # m at the flange
 MAX_DISTANCE = 50.0  # m from the base: floor, boxes, instruments
+MAX_SIGHT = 500.0  # m, of an instrument: laser trackers measure up to 160 m
 PAYLOAD_ERROR, PAYLOAD_WARNING = 3000.0, 300.0  # kg, without a rated payload
 UR_JOINTS = 6
 LENGTH_ERROR_FACTOR = 2.0  # times the reach, plus 1 m
@@ -128,6 +129,12 @@ def _session(section: CalibrationSettings, arm: Arm, arm_reach: float) -> Iterat
         places += [((*keys, "lower"), box.lower), ((*keys, "upper"), box.upper)]
         if np.any(np.array(box.lower) >= box.upper):
             yield Implausible((*keys, "lower"), f"{box.lower}", f"less than upper, {box.upper}")
+    if (sight := section.instrument_range) is not None:
+        places.append(((top, "instrument_range", "nearest"), [sight.nearest]))
+        farthest = np.inf if sight.farthest is None else sight.farthest
+        if farthest <= sight.nearest or MAX_SIGHT < farthest < np.inf:
+            expected = "m (it looks like mm)" if farthest > MAX_SIGHT else "more than nearest"
+            yield Implausible((top, "instrument_range", "farthest"), f"{farthest:g}", expected)
     for at, xyz in places:
         if (size := max(map(abs, xyz), default=0.0)) > MAX_DISTANCE:
             yield Implausible(at, f"{size:g}", "m (it looks like mm)")

@@ -113,6 +113,8 @@ def slip_text(slip: Slip) -> str:
     more = f"; {besides} nothing else changed" if slip.alone else (
         "; whether anything else changed is open"
     )  # fmt: skip
+    if joint is None and slip.between_sessions:
+        more += "; if it was remounted between the sessions, add --remounted"
     if slip.session:
         return f"{moved} moved by {distance}; {slip.session} is the first session that has it{more}"
     return f"{moved} moved by {distance} between {between_text(slip)}{more}"

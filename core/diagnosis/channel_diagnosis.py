@@ -118,6 +118,14 @@ def first_session(moment: float, log: Log) -> str:
     return log.session_names[int(session[after].min() if after.any() else session.max())]
 
 
+def is_between_sessions(moment: float, log: Log) -> bool:
+    """Return whether no session has rows before and after ``moment``, s of the joined clock."""
+    session, after = session_of(log), log.times() > moment
+    if after.all() or not after.any():
+        return False
+    return bool(session[~after].max() < session[after].min())
+
+
 def on_own_clocks(channel: ChannelDiagnosis, log: Log) -> ChannelDiagnosis:
     """Return a channel's diagnosis whose moments are of the sessions' own clocks.
 

@@ -16,6 +16,7 @@ from gapbridge.core.diagnosis.channel_diagnosis import (
     ChannelDiagnosis,
     Verdict,
     first_session,
+    is_between_sessions,
     model_terms,
     on_own_clocks,
     terms_with_stand_ins,
@@ -315,6 +316,7 @@ def _slips(channel: ChannelDiagnosis, terms: Sequence[Term], log: Log) -> list[S
             alone=channel.verdict is Verdict.EXPLAINED and carried,
             session="" if log.one_clock else first_session(term.values[-1], log),
             others=len(found) - 1,
+            between_sessions=is_between_sessions(term.values[-1], log),
         )
         for term, before, after in found
     ]  # fmt: skip

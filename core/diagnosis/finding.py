@@ -96,6 +96,7 @@ class Slip:
     alone: bool  # no structure remains and nothing differs between sessions: the model holds
     session: str = ""  # the first session that has it, where the sessions' clocks overlap
     others: int = 0  # slips besides it
+    between_sessions: bool = False
 
 
 Fact = TooFewRows | Thinned | Outliers | NotAccused | Slip | ParameterNote

@@ -32,8 +32,6 @@ from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import InputError, RunError
 from gapbridge.drivers.clock import SYSTEM
 
-OUT = Path("out/fleet")
-
 
 @click.group()
 def fleet() -> None:
@@ -43,9 +41,9 @@ def fleet() -> None:
     """
 
 
-def shared_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of both commands."""
-    for option in reversed((
+def shared_options(out: Path) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator that adds the options of both commands; results go to ``out``."""
+    options = (
         click.argument("logs", nargs=-1, required=True, metavar="DIR_OR_GLOB..."),
         click.option(
             "--cell", required=True, metavar="CELL",
@@ -58,7 +56,7 @@ def shared_options(command: Callable[..., None]) -> Callable[..., None]:
             "or the file's name up to its first underscore.",
         ),
         click.option(
-            "--out", type=FILE, default=OUT, show_default=True,
+            "--out", type=FILE, default=out, show_default=True,
             metavar="DIR", help="Folder of the results; an interrupted run is resumed there.",
         ),
         click.option("--fresh", is_flag=True, help="Start over, ignoring earlier results."),
@@ -70,9 +68,14 @@ def shared_options(command: Callable[..., None]) -> Callable[..., None]:
             "--scheduler", metavar="ADDRESS",
             help="Use the Dask cluster of this scheduler instead, such as tcp://10.0.0.5:8786.",
         ),
-    )):  # fmt: skip
-        command = option(command)
-    return command
+    )  # fmt: skip
+
+    def added(command: Callable[..., None]) -> Callable[..., None]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return added
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,7 @@ class FleetOptions:
 
 
 @fleet.command()
-@shared_options
+@shared_options(Path("out/fleet"))
 @click.option(
     "--withhold", multiple=True, metavar="EFFECT", help="Remove an effect from the catalogue."
 )
@@ -117,7 +120,7 @@ def diagnose(withhold: tuple[str, ...], **values: Any) -> None:
 
 
 @fleet.command()
-@shared_options
+@shared_options(Path("out/fit"))
 @click.option(
     "--apply", "cells", type=FILE, metavar="DIR",
     help="Write a new cell per arm there, and cells.csv, a table of them."

@@ -83,6 +83,14 @@ def test_a_value_that_is_not_constant_names_the_quantity() -> None:
               alone=True),
          "target_slip: the target on the tool moved by 0.5 mm between 7 s and 8 s from the start; "
          "before and after it nothing else changed"),
+        (Slip(Term("target_slip", Site(), (3e-4, 4e-4, 0.0, 107.5)), 107, 108, 100, 120, True,
+              alone=True, between_sessions=True),
+         "target_slip: the target on the tool moved by 0.5 mm between 7 s and 8 s from the start; "
+         "before and after it nothing else changed; if it was remounted between the sessions, add "
+         "--remounted"),
+        (slipped(42, 43, session="b.csv", between_sessions=True),
+         "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg); b.csv is the first session "
+         "that has it; before and after it nothing else changed"),
         (ParameterNote(ParameterState.ON_BOUND, "backlash_2", 0.0, "rad"),
          "backlash_2 is at its bound (0 rad)"),
         (ParameterNote(ParameterState.NOMINAL, "link_geometry_5_alpha", 0.0, "rad"),

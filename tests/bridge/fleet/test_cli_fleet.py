@@ -18,6 +18,7 @@ from on_a_phone import CHROMIUM, faults_on_a_phone
 from pyarrow import parquet
 
 from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cli.log import fleet
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.log.log import read_log
 from gapbridge.core.model import Model
@@ -54,6 +55,14 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
         "--apply", folder / "cells",
     )  # fmt: skip
     return folder, answer
+
+
+def test_by_default_a_fit_does_not_overwrite_the_results_of_a_diagnosis() -> None:
+    folders = [
+        next(option.default for option in command.params if option.name == "out")
+        for command in (fleet.diagnose, fleet.fit)
+    ]
+    assert len(set(folders)) == 2
 
 
 def test_a_bad_log_is_reported_in_one_line_and_the_others_are_fitted(fitted: Any) -> None:

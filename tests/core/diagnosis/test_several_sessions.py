@@ -17,7 +17,7 @@ from gapbridge.bridge.api.uncertainty import cause_entries
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text
 from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.across_sessions import SessionTransfer, session_transfer
-from gapbridge.core.diagnosis.channel_diagnosis import terms_with_stand_ins
+from gapbridge.core.diagnosis.channel_diagnosis import is_between_sessions, terms_with_stand_ins
 from gapbridge.core.diagnosis.channels.position import observe
 from gapbridge.core.diagnosis.diagnosis import _log_findings, _slips, diagnose
 from gapbridge.core.diagnosis.observation import Observation
@@ -29,7 +29,7 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
-from gapbridge.core.sessions import join_sessions
+from gapbridge.core.sessions import join_sessions, session_of
 
 MODEL = small.model_of()
 
@@ -238,7 +238,16 @@ def test_a_slip_is_not_all_that_changed_where_a_cause_differs_between_sessions(s
     changed = replace(channel, session_transfer=(*channel.session_transfer, other))
     (slip,) = _slips(changed, channel.causes[0].terms, sessions_with_slip())
     assert slip.alone is carried
-    assert (slip.others, slip.session) == (0, "35.csv")
+    assert (slip.others, slip.session, slip.between_sessions) == (0, "35.csv", True)
+
+
+def test_a_moment_inside_a_session_is_between_none() -> None:
+    log = sessions_with_slip()
+    session, times = session_of(log), log.times()
+    middle, end = (f(times[session == 1]) for f in (np.median, np.max))
+    assert [is_between_sessions(t, log) for t in (times[0] - 1, middle, end, times[-1])] == [
+        False, False, True, False,
+    ]  # fmt: skip
 
 
 def test_where_clocks_overlap_a_step_is_told_by_the_first_session_that_has_it(slipped) -> None:
