@@ -161,8 +161,8 @@ def _judge(name: str, answer: Answer, test: Table, program: Program) -> list[Out
         ours = _left(name, channel, program, place, train, test)
         judged = float(after[channel]["gap_rms"]) if channel in after else _rms(ours)
         theirs, rival = _rival(channel, answer, test, program)
-        if channel == "wrench":  # a diagnosis of few rows may leave one out as an outlier
-            ours, theirs = _comparable(ours, theirs)
+        if channel in ("wrench", "tracking"):  # a diagnosis leaves out outliers, each its own
+            ours, theirs = _comparable(channel, ours, theirs)
             judged, rival = _rms(ours), _rms(theirs)
         published = _published(name, ours) if channel == "position" else None
         sizes = judged, rival, ratio_error(ours, theirs, test.moving)
@@ -242,11 +242,18 @@ def _rival(channel: str, answer: Answer, test: Table, program: Program) -> tuple
     return left, float(seen[channel]["gap_rms"])
 
 
-def _comparable(ours: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return residual wrenches (N, 6) in N: the torques of ``theirs`` count as much as its forces.
+def _comparable(
+    channel: str, ours: np.ndarray, theirs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the residuals (m, k) of the rows that have both.
 
-    Without torques to speak of they count nothing.
+    Of wrenches in N: the torques of ``theirs`` count as much as its forces. Without torques to
+    speak of they count nothing.
     """
+    both = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
+    ours, theirs = ours[both], theirs[both]
+    if channel != "wrench":
+        return ours, theirs
     force, torque = _rms(theirs[:, :3]), _rms(theirs[:, 3:])
     weight = np.repeat([1.0, force / torque if torque > 1e-9 * force else 0.0], 3)
     return ours * weight, theirs * weight

@@ -9,7 +9,7 @@ import yaml
 from benchmarks.real import arms, rivals
 from benchmarks.real.convert import SOURCES, write
 from benchmarks.real.geometry import registered
-from benchmarks.real.judging import judge_log
+from benchmarks.real.judging import _comparable, judge_log
 from benchmarks.real.table import Table, read_table
 
 RNG = np.random.default_rng(11)
@@ -125,6 +125,15 @@ def test_wrenches_are_judged_by_every_row_and_not_by_what_is_left_of_outliers(tm
     (outcome,) = judge_log(tmp_path, OneRowIsAnOutlier())
     assert 0.3 < outcome.ratio < 3
     assert 0.3 < outcome.judged < 3
+
+
+def test_tracking_is_judged_on_the_rows_that_both_predict():
+    ours, theirs = np.ones((4, 2)), np.full((4, 2), 2.0)
+    ours[0, 1], theirs[3] = np.nan, np.nan
+    ours[1:3] = 3.0
+    judged, rival = _comparable("tracking", ours, theirs)
+    assert judged.tolist() == [[3.0, 3.0]] * 2
+    assert rival.tolist() == [[2.0, 2.0]] * 2
 
 
 def test_least_squares_of_poses_say_that_they_need_rows(tmp_path):
