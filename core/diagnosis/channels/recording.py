@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.derivatives import signal_noise
-from gapbridge.core.diagnosis.criteria import MIN_TORQUE_CHANGE, STEPPED_SHARE
+from gapbridge.core.diagnosis.criteria import MIN_TORQUE_CHANGE, SMOOTHED, STEPPED_SHARE
 from gapbridge.core.diagnosis.observation import HELD_TORQUE
 from gapbridge.core.diagnosis.thinning import drawn
 from gapbridge.core.estimation.held_out import pose_groups
@@ -127,13 +127,16 @@ def instrument_noise(signal: Array, motion: Motion) -> Array | None:
     """Return 1 sigma (k,) of a recorded signal (N, k) from differences of neighbouring samples.
 
     At least the quantisation noise (step over the root of 12). None for poses at rest, because
-    neighbours in the log are different poses.
+    neighbours in the log are different poses, and for a signal that was smoothed: the higher the
+    differences, the less they show.
     """
     if not motion.moving:
         return None
-    whole = np.isfinite(signal).all(axis=1)
-    step = signal_step(signal[whole])
-    return np.asarray(np.maximum(signal_noise(signal[whole]), step / np.sqrt(12)))
+    signal = signal[np.isfinite(signal).all(axis=1)]
+    noise = np.maximum(signal_noise(signal), signal_step(signal) / np.sqrt(12))
+    # white noise of 1 sigma has fourth differences of root 70, sixth ones of root 924
+    of_sixth = signal_noise(np.diff(signal, 2, axis=0)) * np.sqrt(70 / 924)
+    return None if np.any(of_sixth < SMOOTHED * noise) else np.asarray(noise)
 
 
 def signal_step(signal: Array) -> Array:

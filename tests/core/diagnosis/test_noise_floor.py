@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import small_arm as small
 from further import further
+from scipy.signal import butter, filtfilt, lfilter
 
 import gapbridge.core.diagnosis.diagnosis as whole
+from gapbridge.core.derivatives import signal_noise
 from gapbridge.core.diagnosis import thinning
 from gapbridge.core.diagnosis.channels.recording import instrument_noise, signal_step
 from gapbridge.core.diagnosis.diagnosis import diagnose
@@ -75,6 +77,21 @@ def recording(noise: float, step: float = 0.0) -> tuple[np.ndarray, Log]:
 def test_neighbouring_samples_measure_a_recordings_noise() -> None:
     signal, log = recording(0.3)
     assert instrument_noise(signal, motion_of(log)) == pytest.approx([0.3] * 3, rel=0.1)
+
+
+@pytest.mark.parametrize("joints", [slice(None), slice(1)])  # the rms needs every one of them
+def test_a_recording_behind_a_low_pass_is_no_measure_of_its_noise(joints: slice) -> None:
+    signal, log = recording(0.3)
+    smoothed = signal.copy()
+    smoothed[:, joints] = filtfilt(*butter(4, 20, fs=250), signal[:, joints], axis=0)
+    assert signal_noise(smoothed)[0] < 1e-3
+    assert instrument_noise(smoothed, motion_of(log)) is None
+
+
+def test_a_sensors_own_filter_leaves_its_noise() -> None:
+    signal, log = recording(0.3)
+    filtered = lfilter(*butter(1, 20, fs=250), signal, axis=0)
+    assert instrument_noise(filtered, motion_of(log)) == pytest.approx([0.028] * 3, rel=0.1)
 
 
 def test_a_recording_is_no_finer_than_its_resolution() -> None:
