@@ -131,10 +131,9 @@ def _session(section: CalibrationSettings, arm: Arm, arm_reach: float) -> Iterat
             yield Implausible((*keys, "lower"), f"{box.lower}", f"less than upper, {box.upper}")
     if (sight := section.instrument_range) is not None:
         places.append(((top, "instrument_range", "nearest"), [sight.nearest]))
-        farthest = np.inf if sight.farthest is None else sight.farthest
-        if farthest <= sight.nearest or MAX_SIGHT < farthest < np.inf:
-            expected = "m (it looks like mm)" if farthest > MAX_SIGHT else "more than nearest"
-            yield Implausible((top, "instrument_range", "farthest"), f"{farthest:g}", expected)
+        if (farthest := sight.farthest or 0.0) > MAX_SIGHT:
+            where = (top, "instrument_range", "farthest")
+            yield Implausible(where, f"{farthest:g}", "m (it looks like mm)")
     for at, xyz in places:
         if (size := max(map(abs, xyz), default=0.0)) > MAX_DISTANCE:
             yield Implausible(at, f"{size:g}", "m (it looks like mm)")

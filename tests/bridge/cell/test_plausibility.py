@@ -79,8 +79,6 @@ def dh(**changed: float) -> str:
          "calibration.joint_range.lower", "90", "degrees"),
         (session("instrument_range: {nearest: 300}"), 2, "instrument_range.nearest", "300", "mm"),
         (session("instrument_range: {farthest: 6000}"), 2, "range.farthest", "6000", "mm"),
-        (session("instrument_range: {nearest: 3, farthest: 2}"), 2, "instrument_range.farthest",
-         "2", "more than nearest"),
         (session("loads: [{mass: 900}]"), 2, "calibration.loads entry 1.mass", "900", "kg"),
         (session("loads: [{mass: 2, cog: [0, 0, 50]}]"), 2, "entry 1.cog", "50 m", "mm"),
         ("robot: {model: ur10e, calibration: {delta_theta: [0, 0, 0, 0, 0, 0],\n"
