@@ -61,7 +61,7 @@ OVER_INSTRUMENT_SIGMA = 5.0  # times the instrument's sigma, for coarse instrume
 # The noise floor
 MIN_REPEATS_FOR_FLOOR = 10  # degrees of freedom: sigma is then known to a quarter
 SMOOTHED = 0.5  # noise by sixth differences over that by fourth ones, below which a signal was
-# smoothed: 0.003 to 0.5 in four smoothed real recordings, 0.76 to 1.09 in 30 others
+# smoothed: 0.003 to 0.5 of torques in four smoothed recordings, 0.76 to 1.09 in 30 other channels
 MIN_SAMPLES_FOR_RESIDUAL_RMS = 400  # from which the residual's rms is the better estimate
 # What a log can show
 MIN_EXCITATION = 3.0  # whitened length of the columns of an effect of usual size, in sigmas
