@@ -151,8 +151,8 @@ def test_how_long_a_thread_has_waited_for_a_core_is_the_kernels_count() -> None:
             assert other.stdout is not None
             other.stdout.readline()  # it has begun
         before, begun = core_waits(), time.monotonic()
-        until = time.process_time() + 0.3
-        while time.process_time() < until:
+        until = time.thread_time() + 0.3
+        while time.thread_time() < until:
             pass
         waited, lasted = longest_wait(before), time.monotonic() - begun
     finally:
@@ -160,13 +160,14 @@ def test_how_long_a_thread_has_waited_for_a_core_is_the_kernels_count() -> None:
         for other in others:
             other.kill()
             other.communicate()
-    assert 0.3 < waited < lasted - 0.29
+    # 0.3 s it had the core; other threads of this process may have waited a little longer
+    assert 0.3 < waited < lasted - 0.2
 
 
 def test_who_sleeps_waits_for_no_core() -> None:
-    before = core_waits()
+    before, begun = core_waits(), time.monotonic()
     time.sleep(0.5)
-    assert longest_wait(before) < 0.25
+    assert longest_wait(before) < time.monotonic() - begun - 0.4
 
 
 def test_a_thread_that_ends_takes_nothing_from_what_the_others_waited() -> None:
