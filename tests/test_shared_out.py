@@ -1,4 +1,7 @@
-"""Files are shared out whole, and those that mostly wait to two processes only."""
+"""Files are shared out whole, and those that mostly wait to two processes only.
+
+The simulated runs are shared out one by one.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from waiting import COMPUTE, WAIT, WAITING, waits
 
 pytest.importorskip("xdist")
 
-from shared_out import Scheduling
+from shared_out import ONE_BY_ONE, Scheduling
 
 HERE = Path(__file__).parent
 
@@ -68,6 +71,20 @@ def test_files_stay_whole_and_those_that_wait_go_to_two_processes(processes: int
     for name, ran in found.items():  # who waits takes others only when nothing else is left
         kinds = [waits(test) for test in ran]
         assert kinds == sorted(kinds, reverse=True) if name in WAITING else not any(kinds)
+
+
+def test_long_cases_are_shared_out_one_by_one_and_last() -> None:
+    files = ["bridge/web/test_a.py", "core/test_b.py", "core/test_c.py"]
+    others = [f"tests/{file}::test_{i}" for file in files for i in range(5)]
+    runs = [f"{ONE_BY_ONE}_holds[{i}]" for i in range(40)]
+    found = shared_out(runs + others, 4)
+    assert sorted(test for ran in found.values() for test in ran) == sorted(runs + others)
+    for ran in found.values():
+        kinds = [test in runs for test in ran]
+        assert kinds == sorted(kinds)
+        assert 5 <= sum(kinds) <= 15
+    file, name = ONE_BY_ONE.split("::")
+    assert f"def {name}" in (HERE.parent / file).read_text(encoding="utf-8")
 
 
 def test_every_file_that_waits_is_there() -> None:
