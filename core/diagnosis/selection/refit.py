@@ -321,9 +321,12 @@ def worth(term: Term, spread: Array) -> float:
 
     The smaller one of the whole term and of its most significant parameter. Of a periodic line
     that is the amplitude; parameters of shape do not count, but 0 is returned where one is not
-    identifiable: a Stribeck velocity of 10 +- 50 rad/s is Coulomb friction.
+    identifiable: a Stribeck velocity of 10 +- 50 rad/s is Coulomb friction, a stiffness curve
+    without curvature an axial compliance.
     """
     effect, value = CATALOGUE[term.effect], np.array(term.values[: len(spread)])
+    if effect.has_nonlinearity and value[-1] <= 0.0:
+        return 0.0
     if effect.start_values and len(value) > 1 and spread[-1, -1] > value[-1] ** 2:
         return 0.0
     whole = squared_sigmas(value, spread) / (1 + EXTRA_PARAMETER_WEIGHT * (len(value) - 1))

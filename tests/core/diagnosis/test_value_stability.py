@@ -267,6 +267,9 @@ def test_the_links_prior_is_estimated_again_for_the_remaining_terms(links):
         # of a line the amplitude, not one of its parts
         ("transmission_error", 17.0, (2.9, 2.9), 0.5 * np.eye(2), True),
         ("transmission_error", 17.0, (2.0, 2.0), np.array([[1.0, 0.9], [0.9, 1.0]]), False),
+        # a stiffness curve on the bound of its curvature, where that has no deviation
+        ("stiffness_nonlinearity", None, (6e-6, 0.0), np.diag([1e-14, 0.0]), False),
+        ("stiffness_nonlinearity", None, (6e-6, 1e-4), np.diag([1e-14, 1e-10]), True),
     ],
 )
 def test_a_significant_term_has_a_significant_parameter(effect, order, values, spread, sure):
