@@ -16,7 +16,7 @@ from gapbridge.core.log.columns import did_you_mean
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogFinding
 from gapbridge.core.metrology import Metrology
-from gapbridge.core.sessions import sessions_in
+from gapbridge.core.sessions import sessions_in, with_sessions
 
 MEASURED = "measured_position"
 
@@ -26,7 +26,7 @@ def log_findings(cell: Cell, path: Path) -> Findings:
 
     Raises InputError if the log cannot be used.
     """
-    log = open_log(path, cell)
+    log = with_sessions(open_log(path, cell), cell.model)
     if not log.has(MEASURED):
         hint = did_you_mean(log.unknown, [MEASURED], log.n)
         raise LogError(

@@ -16,6 +16,7 @@ from gapbridge.core.estimation.flexibilities import flexibilities, typical_flexi
 from gapbridge.core.estimation.hierarchical_evidence import evidence
 from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import Log
+from gapbridge.core.sessions import with_sessions
 
 EPOCH = 1.0e9  # s: larger timestamps are Unix times, smaller ones relative
 
@@ -92,7 +93,7 @@ def _rows(channel: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def fit_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return a session's equations, its columns' ranges, the flexibilities of the cell, rad/Nm."""
-    equations = evidence(cell.model, log, cell.metrology)
+    equations = evidence(cell.model, with_sessions(log, cell.model), cell.metrology)
     arrays = {"matrix": equations.matrix.tolist(), "right": equations.right.tolist()}
     return {
         **facts(cell, log),

@@ -22,7 +22,7 @@ from gapbridge.core.estimation.compliance_fit import (
     weighted_factor,
 )
 from gapbridge.core.estimation.flexibilities import prior_of
-from gapbridge.core.estimation.identification import measured_rows
+from gapbridge.core.estimation.identification import data_of
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.robust import OUTLIER, distance_of, noise_of, scale_of
 from gapbridge.core.log.log import Log
@@ -59,14 +59,15 @@ def evidence(model: Model, log: Log, metrology: Metrology | None = None) -> Evid
     too few poses.
     """
     metrology = metrology or Metrology()
-    data, used = measured_rows(log, metrology.registered)
+    data, used = data_of(log, metrology)
     least = MIN_REGISTERED if metrology.registered else MIN_POSES
     if len(used) < least:
         raise ExcitationError(
             f"found {len(used)} row(s) with measured poses, expected at least {least}"
         )
     if metrology.registered:  # the tool may be bent all the same: its point alone is a nuisance
-        data = replace(data, session=np.zeros(len(used), dtype=np.int64), remounted=True)
+        one = np.zeros(len(used), dtype=np.int64)
+        data = replace(data, session=one, sessions=1, remounted=True)
     all_free = np.ones(2 * model.arm.n, dtype=bool)
     fit = fit_flexibilities(fit_nuisances(model, data), data, all_free, prior_of(model))
     return _reduced(fit, data, metrology)

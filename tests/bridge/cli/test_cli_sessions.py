@@ -166,14 +166,37 @@ def test_two_logs_are_one_fit(tmp_path: Path) -> None:
     assert high - low < 5e-6
 
 
-def test_a_column_session_is_read_too(tmp_path: Path) -> None:
-    parts = [session(tmp_path, name, i).read_text().splitlines() for i, name in enumerate(FRAMES)]
+def both_in(folder: Path) -> Path:
+    """Write a log of two sessions in a column."""
+    parts = [session(folder, name, i).read_text().splitlines() for i, name in enumerate(FRAMES)]
     rows = [f"{line},{i + 1}" for i, part in enumerate(parts) for line in part[1:]]
-    log = tmp_path / "both.csv"
+    log = folder / "both.csv"
     log.write_text("\n".join([parts[0][0] + ",session", *rows]) + "\n", encoding="utf-8")
+    return log
+
+
+def test_a_column_session_is_read_too(tmp_path: Path) -> None:
+    log = both_in(tmp_path)
     answer = gapbridge("fit", log, "--cell", cell_in(tmp_path), "--out", tmp_path / "f.yaml")
     assert answer.code == 0, answer.err
     assert "to expect in a new session" in answer.out
+
+
+def test_a_check_gives_each_session_of_a_column_its_own_frame(tmp_path: Path) -> None:
+    answer = gapbridge("check", cell_in(tmp_path), "--log", both_in(tmp_path))
+    assert (answer.code, answer.err) == (0, "")
+
+
+def test_a_fleet_gives_each_session_of_a_column_its_own_frame(tmp_path: Path) -> None:
+    (tmp_path / "arm").mkdir()
+    both_in(tmp_path).rename(tmp_path / "arm" / "both.csv")
+    answer = gapbridge(
+        "fleet", "fit", tmp_path / "arm", "--cell", cell_in(tmp_path), "--workers", 1,
+        "--out", tmp_path / "out", "--apply", tmp_path / "cells",
+    )  # fmt: skip
+    assert answer.code == 0, answer.err
+    (cell,) = (tmp_path / "cells").glob("*.yaml")
+    assert load_cell(cell).model.compliance()[0][1] == pytest.approx(2e-5, rel=0.05)
 
 
 def test_sessions_of_another_arm_are_refused_in_one_line(tmp_path: Path) -> None:
