@@ -115,6 +115,11 @@ def slip_text(slip: Slip) -> str:
     )  # fmt: skip
     if joint is None and slip.between_sessions:
         more += "; if it was remounted between the sessions, add --remounted"
+    if joint == 1 and not slip.between_sessions:  # it turns all that is measured about its axis
+        more += (
+            "; an instrument that was moved there looks the same: if it was, number the rows from "
+            "there as another session (column session)"
+        )
     if slip.session:
         return f"{moved} moved by {distance}; {slip.session} is the first session that has it{more}"
     return f"{moved} moved by {distance} between {between_text(slip)}{more}"

@@ -100,7 +100,7 @@ TEXTS = {
 }
 MAX_LISTED = 8  # moves between stops that are listed
 READINGS = {
-    "measured_position": "measured position",
+    "measured_position": "measured position (empty, or three zeros)",
     "measured_rotation": "measured rotation",
     "ft_raw_wrench": "wrench",
     "actual_current_as_torque": "joint torques",

@@ -363,7 +363,7 @@ def test_odd_rows_and_names_are_reported_where_work_is_still_possible(tmp_path: 
     assert "axial_compliance of joint 2" in answer.out
     for words in (
         "note: 20 timestamp(s) are repeated",
-        "note: 1 row(s) have no measured position and were left out",
+        "note: 1 row(s) have no measured position (empty, or three zeros) and were left out",
         "did you mean joint_temperatures_0?",
     ):
         assert words in answer.out

@@ -91,6 +91,15 @@ def test_a_value_that_is_not_constant_names_the_quantity() -> None:
         (slipped(42, 43, session="b.csv", between_sessions=True),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg); b.csv is the first session "
          "that has it; before and after it nothing else changed"),
+        (Slip(Term("joint_slip", Site(1), (2e-3, 107.5)), 107, 108, 100, 120, True, alone=True),
+         "joint_slip: the zero of joint 1 moved by 2 mrad (0.115 deg) between 7 s and 8 s from the "
+         "start; before and after it nothing else changed; an instrument that was moved there "
+         "looks the same: if it was, number the rows from there as another session (column "
+         "session)"),
+        (Slip(Term("joint_slip", Site(1), (2e-3, 107.5)), 107, 108, 100, 120, True, alone=True,
+              between_sessions=True),
+         "joint_slip: the zero of joint 1 moved by 2 mrad (0.115 deg) between 7 s and 8 s from the "
+         "start; before and after it nothing else changed"),
         (ParameterNote(ParameterState.ON_BOUND, "backlash_2", 0.0, "rad"),
          "backlash_2 is at its bound (0 rad)"),
         (ParameterNote(ParameterState.NOMINAL, "link_geometry_5_alpha", 0.0, "rad"),

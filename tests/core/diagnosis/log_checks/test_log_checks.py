@@ -161,7 +161,10 @@ def test_the_clock_of_a_recording_that_repeats_is_reported():
 
 @pytest.mark.parametrize(
     ("name", "phrase"),
-    [("measured_position", "measured position"), ("ft_raw_wrench", "wrench")],
+    [
+        ("measured_position", "measured position (empty, or three zeros)"),
+        ("ft_raw_wrench", "wrench"),
+    ],
 )
 def test_rows_without_a_reading_are_counted(name, phrase):
     values = READ.copy() if name == "measured_position" else np.zeros((len(READ), 6))
