@@ -111,7 +111,9 @@ def implausible_in_urdf(path: Path, arm: Arm) -> Iterator[Implausible]:
         return
     for joint in root.findall("joint"):
         name = str(joint.get("name"))
-        found = re.search(rf"<joint\b[^>]*\bname\s*=\s*[\"']{re.escape(name)}[\"']", text)
+        # with a type: transmissions and controllers name joints too
+        tag = rf"<joint\b(?=[^>]*\btype\s*=)[^>]*\bname\s*=\s*[\"']{re.escape(name)}[\"']"
+        found = re.search(tag, text)
         line = 1 + text.count("\n", 0, found.start()) if found else 1
         where = f"{path}, line {line}: joint {name!r}"
         if name in arm.joint_names and joint.find("mimic") is not None:
@@ -128,15 +130,13 @@ def implausible_in_urdf(path: Path, arm: Arm) -> Iterator[Implausible]:
             )
         if joint.get("type") != "revolute":
             continue
-        for key, most in (
-            ("lower", MAX_LIMIT),
-            ("upper", MAX_LIMIT),
-            ("velocity", MAX_SPEED),
+        for key, most, expected in (
+            ("lower", MAX_LIMIT, "rad (it looks like degrees)"),
+            ("upper", MAX_LIMIT, "rad (it looks like degrees)"),
+            ("velocity", MAX_SPEED, "the joint's largest speed in rad/s, or none if unknown"),
         ):
             if (value := _largest(limit, key)) > most:
-                yield Implausible(
-                    URDF, f"limit {key} {value:g}", "rad (it looks like degrees)", where=where
-                )
+                yield Implausible(URDF, f"limit {key} {value:g}", expected, where=where)
         i = arm.joint_names.index(name) if name in arm.joint_names else None
         if i is not None and (lower := arm.limits.lower[i]) > (upper := arm.limits.upper[i]):
             both = f"limit lower {lower:g} and upper {upper:g}"

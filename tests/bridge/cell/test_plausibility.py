@@ -12,14 +12,14 @@ from gapbridge.core.arm import builtin_rows
 from gapbridge.core.errors import CellError
 
 ARM = "robot: {model: ur10e}\n"
-URDF = """<robot name="r"><link name="base"/>
+URDF = """<robot name="r"><link name="base"/><transmission><joint name="j2"/></transmission>
 <link name="one"><inertial><mass value="{mass}"/></inertial></link><link name="two">
 <inertial><mass value="3"/></inertial></link>
 <joint name="j1" type="revolute"><parent link="base"/><child link="one"/><axis xyz="0 0 1"/>
 <limit lower="-3" upper="3" velocity="2" effort="9"/></joint>
 <joint name="j2" type="revolute"><parent link="one"/><child link="two"/>
 <origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="0 1 0"/>
-<limit lower="{lower}" upper="2" velocity="2" effort="9"/>{more}</joint>
+<limit lower="{lower}" upper="2" velocity="{speed}" effort="9"/>{more}</joint>
 <link name="flange"/><joint name="f" type="fixed"><parent link="two"/><child link="flange"/>
 <origin xyz="0 0 0.4"/></joint></robot>"""
 
@@ -133,6 +133,7 @@ def test_an_unusual_value_is_a_warning(tmp_path: Path, text: str, phrase: str) -
         ({"rpy": "0 90 0"}, "line 6: joint 'j2': found origin rpy 90"),
         ({"lower": "-170"}, "line 6: joint 'j2': found limit lower 170"),
         ({"lower": "2.5"}, "line 6: joint 'j2': found limit lower 2.5 and upper 2, expected lower"),
+        ({"speed": "100"}, "found limit velocity 100, expected the joint's largest speed in rad/s"),
         ({"more": "<mimic joint='j1'/>"}, "line 6: joint 'j2': found <mimic>"),
         ({"mass": "7369"}, "found 7369 kg of link 1"),
         ({"mass": "4000"}, "m reach, expected kg (grams?)"),
@@ -144,7 +145,7 @@ def test_an_unusual_value_is_a_warning(tmp_path: Path, text: str, phrase: str) -
 def test_a_urdf_in_other_units_is_refused_with_its_line_too(
     tmp_path: Path, changed: dict[str, str], phrase: str
 ) -> None:
-    given = {"xyz": "0 0 0.5", "rpy": "0 0 0", "lower": "-2", "more": "", "mass": "4"}
+    given = {"xyz": "0 0 0.5", "rpy": "0 0 0", "lower": "-2", "more": "", "mass": "4", "speed": "2"}
     (tmp_path / "arm.urdf").write_text(URDF.format(**(given | changed)), encoding="utf-8")
     path = written(tmp_path, "robot:\n  urdf: arm.urdf\n")
     with pytest.raises(CellError, match=r"cell\.yaml, line 2: robot\.urdf: ") as caught:
@@ -153,7 +154,7 @@ def test_a_urdf_in_other_units_is_refused_with_its_line_too(
 
 
 def test_a_sane_urdf_passes_and_one_without_a_mass_warns(tmp_path: Path) -> None:
-    given = {"xyz": "0 0 0.5", "rpy": "0 0 0", "lower": "-2", "more": "", "mass": "4"}
+    given = {"xyz": "0 0 0.5", "rpy": "0 0 0", "lower": "-2", "more": "", "mass": "4", "speed": "2"}
     (tmp_path / "arm.urdf").write_text(URDF.format(**given), encoding="utf-8")
     path = written(tmp_path, "robot: {urdf: arm.urdf}\n")
     assert load_cell(path).warnings == ()
