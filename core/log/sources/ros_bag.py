@@ -43,6 +43,8 @@ LAYOUTS = (  # of the controller's state by ROS distribution: points, then point
 )  # fmt: skip
 WRENCHES = ("ft_raw_wrench", "actual_TCP_force")
 MOST_TOPICS = 8  # named where none will do
+WORD, MOST_PADDING = bytes(4), 256  # bytes behind a message
+Reader = Callable[[bytes, str], Any]  # of a message's bytes and type
 
 
 @dataclass
@@ -179,7 +181,7 @@ def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
 
     samples = _Samples(topic)
     connections = [c for c in bag.connections if c.topic == topic]
-    read: Callable[[bytes, str], Any] | None = None
+    read: Reader | None = None
     try:
         for connection, received, data in bag.messages(connections):
             read = read or _reader(path, bag, connection.msgtype, data)
@@ -197,7 +199,7 @@ def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
     return samples
 
 
-def _reader(path: Path, bag: AnyReader, kind: str, data: bytes) -> Callable[[bytes, str], Any]:
+def _reader(path: Path, bag: AnyReader, kind: str, data: bytes) -> Reader:
     """Return the reader of messages of a type, of which ``data`` is one.
 
     Bags of SQLite before ROS 2 Iron hold no definitions: a controller's state is then read by the
@@ -206,23 +208,45 @@ def _reader(path: Path, bag: AnyReader, kind: str, data: bytes) -> Callable[[byt
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     if kind in bag.typestore.fielddefs:
-        return bag.deserialize
-    for points, many in LAYOUTS if _type(kind) == CONTROLLER else ():
-        lines = ["std_msgs/Header header", "string[] joint_names"]
-        lines += [f"{POINTS} {name}" for name in points]
-        lines += ["string[] multi_dof_joint_names"] if many else []
-        lines += [f"{MULTI} multi_dof_{name}" for name in many]
-        store = get_typestore(Stores.ROS2_HUMBLE)
-        store.register(get_types_from_msg("\n".join(lines), kind))
-        try:
-            store.deserialize_cdr(data, kind)
-        except Exception:  # whatever another layout's bytes lead to
-            continue
-        return store.deserialize_cdr
+        return _padded(bag.deserialize)
+    for most in (0, MOST_PADDING):  # zeros behind one layout may be the fields of a longer one
+        for points, many in LAYOUTS if _type(kind) == CONTROLLER else ():
+            lines = ["std_msgs/Header header", "string[] joint_names"]
+            lines += [f"{POINTS} {name}" for name in points]
+            lines += ["string[] multi_dof_joint_names"] if many else []
+            lines += [f"{MULTI} multi_dof_{name}" for name in many]
+            store = get_typestore(Stores.ROS2_HUMBLE)
+            store.register(get_types_from_msg("\n".join(lines), kind))
+            try:
+                _padded(store.deserialize_cdr, most)(data, kind)
+            except Exception:  # whatever another layout's bytes lead to
+                continue
+            return _padded(store.deserialize_cdr)
     raise LogError(
         f"{path}: found no definition of {kind} in the bag, expected one; rewrite it with "
         "`ros2 bag convert` as MCAP, which holds them"
     )
+
+
+def _padded(read: Reader, most: int = MOST_PADDING) -> Reader:
+    """Return a reader that takes up to ``most`` zeros behind a message.
+
+    Fast DDS, ROS 2's usual middleware, counts an alignment for every empty sequence that it does
+    not write; rosbags refuses more than three further bytes. What is read is the same, because
+    the message holds its lengths.
+    """
+
+    def read_padded(data: bytes, kind: str) -> Any:
+        end = len(data)
+        while True:
+            try:
+                return read(data[:end], kind)
+            except Exception:  # rosbags' own, of several kinds
+                if end <= len(data) - most or bytes(data[end - len(WORD) : end]) != WORD:
+                    raise
+            end -= len(WORD)
+
+    return read_padded
 
 
 def _values(kind: str, message: Any) -> dict[str, Any]:

@@ -47,6 +47,7 @@ class Bag:
             get_types_from_msg(CONTROLLER, "control_msgs/msg/JointTrajectoryControllerState")
         )
         self.writer = Writer(path, version=9, storage_plugin=plugin)
+        self.padding = 0  # bytes behind each message
         self.connections: dict[str, Any] = {}
 
     def header(self, stamp: float, frame: str = "base") -> Any:
@@ -60,7 +61,7 @@ class Bag:
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
         message = self.store.types[kind](**fields)
-        raw = self.store.serialize_cdr(message, kind)
+        raw = bytes(self.store.serialize_cdr(message, kind)) + bytes(self.padding)
         self.writer.write(self.connections[topic], round(received * 1e9), raw)
 
     def joint_state(self, k: int, names: tuple[str, ...] = SHUFFLED, topic: str = "/joint_states",
@@ -122,6 +123,17 @@ def test_joints_are_ordered_by_name_and_times_are_the_headers(bag: Bag, tmp_path
     assert "target_q" not in found.columns
     assert Reason.NO_TARGET in [note.reason for note in found.notes]
     assert Reason.EFFORT_UNKNOWN in [note.reason for note in found.notes]
+
+
+def test_zeros_behind_a_message_are_no_part_of_it(bag: Bag, tmp_path: Path) -> None:
+    bag.padding = 12  # as Fast DDS writes behind empty sequences
+    with bag.writer:
+        for k in range(ROWS):
+            bag.joint_state(k)
+            bag.controller_state(k)
+    found = source_of(tmp_path / "bag").read(tmp_path / "bag", UR_JOINTS, SourceOptions())
+    assert np.allclose(found.columns["actual_q"][5], [angles(5)[name] for name in UR_JOINTS])
+    assert np.allclose(found.columns["target_q"] - found.columns["actual_q"], 0.001, atol=1e-4)
 
 
 def test_one_mcap_file_of_a_bag_is_read_too(tmp_path: Path) -> None:
@@ -225,9 +237,10 @@ LAYOUTS = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("padding", [0, 16])
 @pytest.mark.parametrize("distribution", LAYOUTS)
 def test_a_controller_state_is_read_from_a_bag_without_definitions(
-    tmp_path: Path, distribution: str
+    tmp_path: Path, distribution: str, padding: int
 ) -> None:
     points, many = LAYOUTS[distribution]
     kind = "control_msgs/msg/JointTrajectoryControllerState"
@@ -259,7 +272,8 @@ def test_a_controller_state_is_read_from_a_bag_without_definitions(
                 header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=""),
                 joint_names=list(UR_JOINTS), **whole, **rest,
             )  # fmt: skip
-            writer.write(connection, (100 + k) * 10**9, store.serialize_cdr(message, kind))
+            raw = bytes(store.serialize_cdr(message, kind)) + bytes(padding)
+            writer.write(connection, (100 + k) * 10**9, raw)
     with contextlib.closing(sqlite3.connect(tmp_path / "bag" / "bag.db3")) as database:
         database.execute("delete from message_definitions")
         database.commit()
