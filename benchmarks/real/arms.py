@@ -72,6 +72,18 @@ IIWA7 = _links(
     (0, H, 0, 0, 1.6, (0.00021, -0.00579, -0.0088)),
     (0, 0, 0.126, 0, 1.4, (-0.00632, -0.00055, 0.06042)),
 )
+# KUKA iiwa 14 R820 and Kinova Gen3 lite, by their public descriptions
+IIWA14 = _links(
+    (0, -H, 0.36), (0, H, 0), (0, H, 0.42), (0, -H, 0), (0, -H, 0.4), (0, H, 0), (0, 0, 0.126),
+)  # fmt: skip
+GEN3_LITE = _links(
+    (0, H, 0.24325),
+    (0.28, pi, 0.03, H),
+    (0, H, 0.02, H),
+    (0, H, 0.245, H),
+    (0, H, 0.057, pi),
+    (0, 0, 0.105, H),
+)
 # Yaskawa Motoman MA1400, the right arm beyond its common torso; the rows of the data set
 MA1400 = _links(
     (0.150, -H, 1.4159),

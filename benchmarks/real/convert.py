@@ -2,8 +2,9 @@
 
 ``python -m benchmarks.real.convert CHECKOUTS --out DIR``: CHECKOUTS holds clones of the sources
 under their own names (``git clone https://github.com/OWNER/NAME``; hanbyeolyoonucla's, a second
-``robot-calibration``, as ``meca500``); what is not there is skipped. Later commits of FloBaRoID
-and dynamic-identification lack their data: these two at the commits of ``SOURCES``.
+``robot-calibration``, as ``meca500``); what is not there is skipped. Later commits of FloBaRoID,
+dynamic-identification and dynamic_parameter_identification lack their data: these three at the
+commits of ``SOURCES``.
 None of these sets is part of this repository.
 """
 
@@ -24,6 +25,7 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from benchmarks.real import arms
+from benchmarks.real import convert_further as further
 from benchmarks.real import convert_more as more
 from benchmarks.real.converted import (
     Array,
@@ -590,6 +592,7 @@ XMATE_SET = ("NKU-ZiXuan/xMate7p_dyn_ident", "7d8c9246adfc2a14d161df41a21a706714
 LWR4_SET = ("kjyv/FloBaRoID", "e6c077ea5c09bceb49840f49e83450bb5979029b")
 GEN3_SET = ("wissem01chiha/dynamic-identification", "90ba37d676d8da6c064d9edf5c1a09389309752e")
 FT_SET = ("AndreFug/AIS2202-Modul2", "1b73c0cacb0fd34853648b8057ed708cab5e788c")
+MUKCA_SET = ("platonics-delft/kinematics_calibration", "05a05ab4cbbe328c8f5bfcc76479c752ed07b82e")
 SO101_SET = ("isaac-sim2real/sage", "4ffd2627df9d23e279b35712a67e629ce0c0dfa7")
 SOURCES: dict[str, Source] = {
     "ur10e_12harmonics": Source(*UR10E_SET, _ur10e("ur-20_02_10-30sec_12harm.csv", 635, 3510)),
@@ -669,6 +672,19 @@ SOURCES: dict[str, Source] = {
     **{f"xmate_{k}": Source(*XMATE_SET, more.xmate(k)) for k in (1, 2, 3)},
     **{f"lwr4_{k}": Source(*LWR4_SET, more.lwr4(k)) for k in (1, 2, 3)},
     **{f"gen3_{k}": Source(*GEN3_SET, more.gen3(f"opti_traj_testing{k}")) for k in (1, 2)},
+    "mukca_panda_2": Source(*MUKCA_SET, further.mukca(arms.PANDA, "panda_2_clean", 0.139)),
+    "mukca_panda_3": Source(*MUKCA_SET, further.mukca(arms.PANDA, "panda_3", 0.139)),
+    "mukca_iiwa14": Source(*MUKCA_SET, further.mukca(arms.IIWA14, "kuka_14", 0.04)),
+    "mukca_gen3lite": Source(*MUKCA_SET, further.mukca(arms.GEN3_LITE, "dinova_2", 0.187)),
+    "ur10_camera": Source(
+        "thanhndv212/figaroh-examples", "c0b5c7f0fda10078be55104f9ee76ac106b7a5ee",
+        further.ur10_camera),
+    "med7": Source(
+        "lbr-stack/dynamic_parameter_identification",
+        "951558d66aa9f2a7aaa208dcaf0f6e0263438369", further.med7),
+    "so101_teleoperated": Source(
+        "SamueleSandrini/record-test", "c6d0de303c6f4c451eb103222af2fff11d0e9963",
+        further.so101_teleoperated),
     **{f"so101_{name}": Source(*SO101_SET, _so101(name)) for name in (
         "multisine", "random_waypoints", "large_amplitude", "backlash_detection")},
 }  # fmt: skip

@@ -39,7 +39,7 @@ def fanuc(folder: Path) -> Converted:
         "instrument": "laser tracker, three reflectors",
     }
     attitude = np.stack([x, np.cross(z, x), z], axis=2)
-    return _with_attitude(arms.R2000, q, point[:, 0], attitude, 2e-5, about)
+    return with_attitude(arms.R2000, q, point[:, 0], attitude, 2e-5, about)
 
 
 def qkm(folder: Path) -> Converted:
@@ -60,7 +60,7 @@ def panda_camera(folder: Path) -> Converted:
     data = _ArraysOnly(io.BytesIO(text)).load()
     camera = np.array(data["camera_poses"])
     about = {"robot": "Franka Emika Panda", "instrument": "its RealSense camera, to a board"}
-    return _with_attitude(arms.PANDA, np.array(data["joint_positions"]), camera[:, :3, 3],
+    return with_attitude(arms.PANDA, np.array(data["joint_positions"]), camera[:, :3, 3],
                           camera[:, :3, :3], 3e-4, about)  # fmt: skip
 
 
@@ -73,10 +73,11 @@ class _ArraysOnly(pickle.Unpickler):
         return super().find_class(module, name)
 
 
-def _with_attitude(
+def with_attitude(
     links: tuple[arms.Link, ...], q: Array, position: Array, attitude: Array, sigma: float,
     about: dict[str, Any],
 ) -> Converted:  # fmt: skip
+    """Return a log of measured poses; the tool's point and turn are the nominal arm's best."""
     point = rough_tool(links, q, position)
     turn = rough_turn(links, q, point, position, attitude)
     columns = {
