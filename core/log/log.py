@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,6 +37,7 @@ from gapbridge.core.log.columns import (
 from gapbridge.core.log.parquet_tables import ParquetColumns
 
 GZIP = b"\x1f\x8b"
+INSIDE = "\x1f"  # in place of a separator inside quotes, while a line is split
 PACKED: dict[bytes, str] = {  # first bytes -> what it is, and what to do
     b"\x28\xb5\x2f\xfd": "a file packed by Zstandard: unpack it (zstd -d)",
     b"\xfd7zXZ\x00": "a file packed by xz: unpack it (unxz)",
@@ -281,6 +283,7 @@ def csv_table(
     Raises LogError where a line has not as many cells as there are names, or a cell is no number.
     """
     wanted = wanted_of(names)
+    lines = [_one_cell_per_text(line, delimiter) if '"' in line else line for line in lines]
     for number, line in zip(numbers, lines, strict=True):
         if line.count(delimiter) != len(names) - 1:
             raise cell_count(path, number, line.count(delimiter) + 1, len(names))
@@ -295,6 +298,11 @@ def csv_table(
          enumerate(line.split(delimiter)) if i in wanted]
         for number, line in zip(numbers, lines, strict=True)
     ])  # fmt: skip
+
+
+def _one_cell_per_text(line: str, delimiter: str) -> str:
+    """Return a line in which a text in quotes, such as a list of names, separates no cells."""
+    return re.sub('"[^"]*"', lambda text: text[0].replace(delimiter, INSIDE), line)
 
 
 def is_comment(line: str) -> bool:
@@ -317,7 +325,7 @@ def cell_count(path: Path, row: int, found: int, expected: int) -> LogError:
 
 def cell_number(path: Path, row: int, name: str, cell: str, delimiter: str) -> float:
     """Return the number in a cell, NaN where it is empty. Raises LogError naming row and column."""
-    text = cell.strip().strip('"')
+    text = cell.strip().strip('"').replace(INSIDE, delimiter)
     try:
         if "_" in text:  # Python reads 1_0 as 10
             raise ValueError

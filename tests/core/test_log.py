@@ -164,6 +164,20 @@ def test_quoted_headers_and_cells_are_read(tmp_path):
     np.testing.assert_allclose(read_log(write(tmp_path, text), 6).require("actual_q"), joints())
 
 
+@pytest.mark.parametrize("delimiter", [",", ";"])
+def test_a_text_in_quotes_separates_no_cells(tmp_path, delimiter):
+    """Recordings of ROS topics as CSV have lists of joint names in a cell."""
+    names = f'"[\'a\'{delimiter} ""b""]"'
+    rows = [[0.1 * k, names, *r] for k, r in enumerate(joints())]
+    path = write(tmp_path, table(["timestamp", "name", *JOINTS], rows, delimiter))
+    for log in (read_log(path, 6), *LogPieces(path, 6)):
+        np.testing.assert_allclose(log.require("actual_q"), joints())
+    rows[1][2] = f'"0{delimiter}5"'
+    path = write(tmp_path, table(["timestamp", "name", *JOINTS], rows, delimiter))
+    with pytest.raises(LogError, match=f"row 3, column {JOINTS[0]}: found '0{delimiter}5'"):
+        read_log(path, 6)
+
+
 @pytest.mark.parametrize("suffix", [".parquet", ".pq", os.fsdecode(b"\xff.pq")])
 def test_parquet_is_the_same_log(tmp_path, suffix):
     path = tmp_path / f"log{suffix}"
