@@ -21,7 +21,7 @@ from gapbridge.drivers.can.loading import read_profile
 from gapbridge.drivers.can.reader import FrameReader
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can.state import StateBuilder
-from gapbridge.drivers.can.writer import FrameWriter
+from gapbridge.drivers.can.writer import FrameWriter, Hold
 from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.profile_file import ProfileError
@@ -233,8 +233,9 @@ class CanDriver(Driver):
                 self.writer.write(hold)
         except LinkError:
             target = self.writer.target
+            hold = start if target is None else target
             with contextlib.suppress(LinkError):
-                self._run_release(lambda: start if target is None else target)
+                self._run_release(lambda: hold if self._is_near(start) else None)
             raise
         self._armed_at = self._changed = self._now()
         self._reset_reading()
@@ -247,12 +248,17 @@ class CanDriver(Driver):
     def _near(self, start: Array) -> Array:
         """Return the present joints (n,), rad, to be held. Raises WriteError where they moved."""
         present = self._present()
-        displacement = float(np.abs(present - start).max())
-        if not displacement <= self.settings.arming_distance:
+        if not self._is_near(start):
+            displacement = float(np.abs(present - start).max())
             raise WriteError(
                 f"{self.profile.name}: the arm moved {displacement:.3f} rad when enabled"
             )
         return present
+
+    def _is_near(self, start: Array) -> bool:
+        """Return whether the joints are where enabling began: only there may they be held."""
+        displacement = float(np.abs(self._present() - start).max())
+        return displacement <= self.settings.arming_distance  # NaN is not
 
     def _listen(self, seconds: float) -> None:
         """Read for ``seconds``, sending requests where needed; updates the present joints."""
@@ -310,8 +316,7 @@ class CanDriver(Driver):
         self.writer.reset()
         self._reset_reading()
 
-    def _run_release(self, hold: object) -> None:
-        assert callable(hold)
+    def _run_release(self, hold: Hold) -> None:
         self.writer.run(self.profile.release, hold, self._listen, self._reached)
         self.writer.reset()
 

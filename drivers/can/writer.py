@@ -14,6 +14,7 @@ from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.clock import Clock
 
 Frames = list[tuple[Key, bytes]]
+Hold = Callable[[], Array | None]  # joints (n,), rad, of a hold step; None: nothing is to be held
 
 
 class FrameWriter:
@@ -89,7 +90,7 @@ class FrameWriter:
     def run(
         self,
         actions: Sequence[Action],
-        hold: Callable[[], Array],
+        hold: Hold,
         listen: Callable[[float], object],
         reached: Callable[[str], bool],
     ) -> None:
@@ -112,11 +113,11 @@ class FrameWriter:
                         f"{action.within:g} s"
                     )
 
-    def _do(self, action: Action, hold: Callable[[], Array]) -> None:
+    def _do(self, action: Action, hold: Hold) -> None:
         for frame in action.frames:
             self._send(frame.key, self._bytes_of(frame))
-        if action.hold:
-            self.write(hold())
+        if action.hold and (q := hold()) is not None:
+            self.write(q)
 
     def _bytes_of(self, frame: Outgoing) -> bytes:
         try:

@@ -60,10 +60,34 @@ def test_a_wrong_sample_while_the_motors_are_enabled_is_not_sent_as_the_goal(
     read_wrong_when_enabled(monkeypatch, served, 0.1)
     with pytest.raises(WriteError, match=r"the arm moved 0\.100 rad when enabled"):
         served.driver.arm(state)
-    goals = np.array(goals_of_joint_3(bus))
-    assert goals.size, "the release holds the joints"
-    assert np.abs(goals - state.actual_q[2]).max() < 2 * UNIT
+    assert not goals_of_joint_3(bus)
     assert np.abs(before - served.controller.q).max() < 2 * UNIT
+
+
+def test_an_arm_that_was_moved_while_its_motors_were_enabled_is_not_pulled_back(
+    served: Served, bus: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driver, state = served.driver, next_state(served.driver)
+    moved = state.actual_q.copy()
+    moved[2] += 0.5
+    served.controller.move_own(tuple(moved))  # by a person's hand
+    monkeypatch.setattr(driver, "_reached", lambda _: np.abs(moved - driver._q).max() < 1e-3)
+    with pytest.raises(WriteError, match=r"the arm moved 0\.500 rad when enabled"):
+        driver.arm(state)
+    next_state(driver)
+    assert not goals_of_joint_3(bus)
+    assert np.abs(moved - served.controller.q).max() < 1e-3
+
+
+def test_an_arm_that_stands_where_it_was_is_held_by_a_refused_arming(
+    served: Served, bus: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = next_state(served.driver)
+    monkeypatch.setattr(served.driver, "_reached", lambda goal: goal == "enabled")
+    with pytest.raises(WriteError, match=r"hold: not ready after 2 s"):
+        served.driver.arm(state)
+    goals = goals_of_joint_3(bus)
+    assert np.abs(np.array(goals) - state.actual_q[2]).max() < 2 * UNIT
 
 
 def test_joints_that_give_a_little_when_enabled_are_armed(
