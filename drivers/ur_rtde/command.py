@@ -100,6 +100,7 @@ class ServoWriter:
         if self._control is None:
             self._control = self._open()
         elif not self._control.isProgramRunning():
+            self._clear_command()
             self._control.reuploadScript()
             self._wait_running()
         if not self._control.setWatchdog(self._settings.watchdog):
@@ -195,11 +196,21 @@ class ServoWriter:
         if control is None:
             return
         if not control.isProgramRunning():
+            self._clear_command()  # the script may be paused, and a person may let it go on
             return
         stopped = control.servoStop(self._settings.stop_deceleration)
         control.stopScript()
         if not stopped:
             raise WriteError(f"{self._settings.host}: the controller refused servoStop")
+
+    def _clear_command(self) -> None:
+        """Clear the command register, which outlives a script. Raises WriteError.
+
+        A script that is resumed or uploaded would go to the last target at once, wherever the arm
+        is by then. Where no script runs, this is all that the library's stopScript does.
+        """
+        if self._control.isConnected():
+            self._control.stopScript()
 
     def abandon(self) -> None:
         """Keep the control object undestroyed: destroying it on a dead link is not safe."""

@@ -97,6 +97,37 @@ def test_a_protective_stop_refuses_the_next_setpoint(controller: SimulatedContro
 
 
 @pytest.mark.slow
+def test_arming_after_a_protective_stop_does_not_go_to_the_target_of_before(
+    controller: SimulatedController,
+) -> None:
+    out = run(
+        controller.host,
+        """
+        import socket
+        stream(50, start + 0.02)
+        bench.do("protective_stop")
+        while read_state().safety_mode != 3:
+            pass
+        error_of(driver.abandon)  # as the loop where it reads the stop before it writes again
+        bench.do("unlock")
+        with socket.create_connection((host, 29999), timeout=5) as dashboard:
+            dashboard.sendall(b"stop\\n")
+            while read_state().runtime_state != 1:
+                pass
+        bench.do("move " + " ".join(map(str, start - 0.1)))
+        while np.abs(read_state().actual_q - start + 0.1).max() > 1e-3:
+            pass
+        driver.arm(read_for(20))
+        state = read_for(100)
+        out["away"] = (state.actual_q - start).tolist()
+        out["still"] = float(np.abs(state.actual_qd).max())
+        """,
+    )
+    assert out["away"] == pytest.approx([-0.1] * 6, abs=2e-3)
+    assert out["still"] < 1e-2  # type: ignore[operator]
+
+
+@pytest.mark.slow
 def test_the_robots_watchdog_ends_the_stream_when_the_client_falls_silent(
     controller: SimulatedController,
 ) -> None:

@@ -252,6 +252,29 @@ def test_what_the_library_raises_is_a_failed_write_in_one_line(servo: Servo) -> 
         again.arm(stopped, lambda: None)
 
 
+def test_the_last_target_is_cleared_before_a_new_script_could_go_there(servo: Servo) -> None:
+    servo.write(setpoint(), state())
+    servo.library.refused = {"isProgramRunning"}  # it was stopped, by whatever
+    servo.library.calls.clear()
+    with pytest.raises(WriteError, match="the control script does not start"):
+        servo.arm(state(runtime_state=STOPPED), lambda: None)
+    names = [call[0] for call in servo.library.calls]
+    assert names.index("stopScript") < names.index("reuploadScript")
+
+
+@pytest.mark.parametrize("connected", [True, False])
+def test_letting_go_of_a_script_that_is_stopped_or_paused_clears_the_last_target(
+    servo: Servo, connected: bool
+) -> None:
+    servo.library.refused = {"isProgramRunning"} if connected else {
+        "isProgramRunning", "isConnected"
+    }  # fmt: skip
+    servo.library.calls.clear()
+    servo.release()
+    named = {name for name, *_ in servo.library.calls} - {"isProgramRunning", "isConnected"}
+    assert named == ({"stopScript"} if connected else set())  # else the library reconnects
+
+
 def test_letting_go_brakes_and_then_ends_the_script(servo: Servo) -> None:
     servo.library.calls.clear()
     servo.release()

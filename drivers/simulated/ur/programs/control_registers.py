@@ -75,7 +75,7 @@ class Registers:
     def clear(self) -> None:
         """Clear the registers for the next program."""
         memory: dict[str, Any] = self._memory
-        for name in (self._in_int[0], *self._out_int):
+        for name in self._out_int:
             memory[name] = 0
 
     # -- asynchronous operations ------------------------------------------------------------------
