@@ -13,7 +13,8 @@ from gapbridge.drivers.canopen.master import Master
 from gapbridge.drivers.canopen.profile import CanopenProfile
 
 Frames = list[tuple[int, bytes, str]]
-OURS = ("Controlword",)  # that we command, in addition to the mode's target
+# that we command, in addition to the mode's target
+OURS = ("Controlword", "Modes of operation")
 
 
 class RpdoWriter:
@@ -39,6 +40,7 @@ class RpdoWriter:
         """Read the objects that we do not command from the drives. Raises LinkError."""
         self.reset()
         for joint, node in enumerate(self._profile.nodes):
+            self._image[joint]["Modes of operation"] = self._profile.mode_number
             for layout in self._profile.rpdo:
                 for entry in layout.entries:
                     if entry.name not in (*OURS, self._profile.target):

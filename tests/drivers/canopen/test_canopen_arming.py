@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import can
 import numpy as np
 import pytest
-from drive_arm import DriveArm, phases, settled
+from drive_arm import DriveArm, phases, served, settled
 from patience import wait_for
+from patient_drives import patient
 
 from gapbridge.core.errors import ForeignCommandError, WriteError
 from gapbridge.drivers.canopen.driver import CanopenDriver
@@ -82,6 +85,22 @@ def test_a_drive_that_is_enabled_in_another_mode_is_left_alone(
     assert drive.axis.mode == INTERPOLATED_POSITION
     assert drive.axis.machine.phase == Phase.ENABLED
     assert {other.axis.mode for other in arm.server.drives} == {0, INTERPOLATED_POSITION}
+
+
+def test_a_mode_that_is_mapped_into_an_rpdo_is_ours(tmp_path: Path) -> None:
+    """It is in the default RPDO2 of CiA 402: sent as it was, drives were enabled in any mode."""
+    path = Path(patient("cia402", tmp_path))
+    text = path.read_text(encoding="utf-8")
+    mapped = text.replace("[Controlword, Target", "[Controlword, Modes of operation, Target")
+    assert mapped != text
+    path.write_text(mapped, encoding="utf-8")
+    with served(str(path)) as arm, arm.driver() as driver:
+        for node in driver.profile.nodes:
+            driver.master.write(node, MODES_OF_OPERATION, INTERPOLATED_POSITION)
+        driver.arm(settled(driver))
+        assert {drive.axis.mode for drive in arm.server.drives} == {driver.profile.mode_number}
+        driver.release()
+        assert {drive.axis.mode for drive in arm.server.drives} == {INTERPOLATED_POSITION}
 
 
 def test_release_gives_the_drives_back_what_they_watched(
