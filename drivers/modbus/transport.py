@@ -33,6 +33,7 @@ WRITE_FUNCTIONS: dict[tuple[Table, bool], int] = {
     ("coil", True): 5, ("coil", False): 15, ("holding", True): 6, ("holding", False): 16,
 }  # fmt: skip
 """Table and whether one value goes in a request of its own -> function."""
+PIECE, MOST_PIECES = 256, 10  # bytes, pieces: what is read of a serial line that is opened
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # reported by our own errors instead
 EXCEPTIONS = {
     1: "illegal function", 2: "illegal address", 3: "illegal value", 4: "device failure",
@@ -101,6 +102,7 @@ class Transport:
         self._writable: frozenset[tuple[Table, int]] = frozenset()
         self._allowed: set[tuple[Table, int, int]] = set()  # runs that were looked up before
         self._client: Any = None
+        self._owed = False  # an answer to a former request may still come
         self._calls: dict[Table, Any] = {}  # the client's methods that read
 
     def allow(self, compiled: RegisterMap) -> None:
@@ -123,6 +125,8 @@ class Transport:
         try:
             client = self._make()
             fine = client.connect()
+            if fine and self._owed and self._settings.transport == "rtu":
+                _wait_for_silence(client.socket)
         except (ModbusException, OSError, ValueError) as error:
             if client is not None:
                 client.close()
@@ -138,7 +142,7 @@ class Transport:
             "coil": client.read_coils, "discrete": client.read_discrete_inputs,
             "holding": client.read_holding_registers, "input": client.read_input_registers,
         }  # fmt: skip
-        self._client = client
+        self._client, self._owed = client, False
 
     def _make(self) -> Any:
         settings = self._settings
@@ -260,8 +264,19 @@ class Transport:
 
     def _give_up(self, error: LinkError) -> NoReturn:
         """Close and raise: a late answer must not be taken for that to the next request."""
+        self._owed = True
         self.close()
         raise error from None
+
+
+def _wait_for_silence(line: Any) -> None:
+    """Read a serial line until nothing comes for its timeout; ends on one that never is silent.
+
+    An answer there has no number: one that is late would be taken for that to the next request.
+    """
+    for _ in range(MOST_PIECES):
+        if not line.read(PIECE):
+            return
 
 
 def _chunks(address: int, values: Sequence[int], one: bool) -> Iterable[tuple[int, list[int]]]:

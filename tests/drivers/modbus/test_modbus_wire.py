@@ -19,14 +19,17 @@ import pytest
 from contract_checks import OFFSET, check_reads, next_state, read_on, setpoint_of, stream, write
 from contract_modbus import ModbusCase
 from evil_proxy import EvilProxy, Ruin
-from patience import wait_for
+from patience import PATIENCE, wait_for
 from ports import free_port
+from pymodbus.framer import FramerRTU
 
 from benchmarks.server_thread import ServerThread
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.modbus.driver import ModbusDriver
+from gapbridge.drivers.modbus.map import Block
 from gapbridge.drivers.modbus.settings import ModbusSettings
+from gapbridge.drivers.modbus.transport import Transport
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
 
 QUICK = {"timeout": 0.25, "state_timeout": 0.5}
@@ -321,6 +324,39 @@ def test_the_contract_holds_over_a_serial_line() -> None:
         cable.cut()
         with pytest.raises(StaleStateError):
             read_on(driver, 100)
+
+
+@pytest.mark.realtime(limit=0.3)
+def test_an_answer_that_comes_late_on_a_serial_line_is_not_that_to_the_next_request() -> None:
+    """It has no number, and may be of other registers: of as many, it fits."""
+    device, port = os.openpty()
+    tty.setraw(device)
+    tty.setraw(port)
+
+    def answer(request: bytes) -> bytes:
+        body = request[:2] + b"\x0c" + 6 * request[2:4]  # each register holds its first address
+        return body + FramerRTU.compute_CRC(body).to_bytes(2, "big")
+
+    def serve() -> None:
+        first = os.read(device, 256)
+        again.wait(PATIENCE)
+        select.select([device], [], [], 0.1)  # the line is open again, the next request not sent
+        os.write(device, answer(first))
+        os.write(device, answer(os.read(device, 256)))
+
+    again = threading.Event()
+    server = threading.Thread(target=serve, daemon=True)
+    server.start()
+    settings = ModbusSettings(profile="ur", transport="rtu", serial=os.ttyname(port), timeout=0.5)
+    transport = Transport(settings, 0, 1)
+    transport.open()
+    with pytest.raises(StaleStateError):
+        transport.read(Block("holding", 10, 6))
+    again.set()
+    transport.open()
+    assert transport.read(Block("holding", 20, 6)) == 6 * b"\x00\x14"
+    transport.close()
+    server.join(PATIENCE)
 
 
 def test_a_serial_port_that_is_not_there_is_a_link_error() -> None:
