@@ -29,6 +29,7 @@ from gapbridge.drivers.robot_modes import (
     why_not_ready,
 )
 from gapbridge.drivers.ur_rtde import registers
+from gapbridge.drivers.ur_rtde.enquiry import RTDE
 from gapbridge.drivers.ur_rtde.registers import Program
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
@@ -75,6 +76,7 @@ class ServoWriter:
         self._clock, self._now = clock, clock.monotonic
         self._settings = settings
         self._control: Any = None
+        self._connection: frozenset[str] = frozenset()  # of the library for writing
         self._period = 1.0 / settings.rate
         self._kicked = 0.0
         self._sent = np.zeros((KEPT, 6))
@@ -116,8 +118,10 @@ class ServoWriter:
         flags = RTDEControlInterface.FLAG_UPLOAD_SCRIPT
         if not settings.remote_control:
             flags |= NO_REMOTE_CHECK
+        before = connections(RTDE)
         try:
             library = RTDEControlInterface(settings.host, settings.rate, flags)
+            self._connection = connections(RTDE) - before
             send_at_once()
             return AllowedControl(settings.host, library)
         except Exception as error:
@@ -141,6 +145,19 @@ class ServoWriter:
         if now - self._kicked > KICK:
             self._running().kickWatchdog()
             self._kicked = now
+            self._check_connection()
+
+    def _check_connection(self) -> None:
+        """Raise WriteError where the library has replaced a connection that had ended.
+
+        By itself it uploads its script anew amid the motion, and goes on as if nothing had been:
+        without the robot's watchdog, which ended with the script before.
+        """
+        if self._connection and not self._connection <= connections():
+            raise WriteError(
+                f"{self._settings.host}: the library's connection for writing has ended and was "
+                "replaced: the robot's watchdog is not set any more"
+            )
 
     def _running(self) -> Any:
         """Return the library's object while its script runs. Raises WriteError."""
@@ -447,6 +464,25 @@ def send_at_once() -> int:
     if not DESCRIPTORS.is_dir():
         return 0
     return sum(_send_at_once(int(name)) for name in os.listdir(DESCRIPTORS))
+
+
+def connections(port: int | None = None) -> frozenset[str]:
+    """Return the sockets of this process, or those that are connected to a port.
+
+    Each has a name of its own in the system. Empty where the system does not list descriptors.
+    """
+    found: set[str] = set()
+    for name in os.listdir(DESCRIPTORS) if DESCRIPTORS.is_dir() else ():
+        with contextlib.suppress(OSError):
+            target = os.readlink(f"{DESCRIPTORS}/{name}")
+            if target.startswith("socket:") and port in (None, _port_of(int(name))):
+                found.add(target)
+    return frozenset(found)
+
+
+def _port_of(descriptor: int) -> int | None:
+    with socket.socket(fileno=os.dup(descriptor)) as end:  # a copy of the descriptor only
+        return int(end.getpeername()[1]) if end.family == socket.AF_INET else None
 
 
 def _send_at_once(descriptor: int) -> bool:

@@ -5,7 +5,10 @@ test_ur_servo.py and test_ur_offset.py show the same over the real protocol, and
 
 from __future__ import annotations
 
+import socket
+import sys
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +18,7 @@ from clock_by_hand import ByHand
 from gapbridge.core.errors import WriteError
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.robot_modes import PAUSED, PLAYING
-from gapbridge.drivers.ur_rtde import registers
+from gapbridge.drivers.ur_rtde import command, registers
 from gapbridge.drivers.ur_rtde.command import (
     CONTROL,
     KICK,
@@ -180,6 +183,40 @@ def test_the_robots_watchdog_is_fed_before_it_expires(servo: Servo, kept: bool) 
             assert names[::-1].index("servoJ") < names[::-1].index("kickWatchdog")  # writes last
         servo.clock.sleep(CYCLE)
     assert np.diff(kicks).max() < (KICK + 2 * CYCLE if kept else 0.5 / SETTINGS.watchdog)
+
+
+def test_a_connection_that_the_library_replaces_ends_the_stream(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its new script has no watchdog: who is killed then leaves it running."""
+    library, clock = Library(), ByHand()
+    opened: list[socket.socket] = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def connect(*_: Any) -> Library:
+            opened.append(socket.create_connection(server.getsockname()))
+            return library
+
+        port = server.getsockname()[1]
+        monkeypatch.setattr(command, "RTDE", port)
+        flags = {"FLAG_UPLOAD_SCRIPT": 1, "__call__": staticmethod(connect)}
+        interface = type("RTDEControlInterface", (), flags)()
+        known = SimpleNamespace(RTDEControlInterface=interface)
+        monkeypatch.setitem(sys.modules, "rtde_control", known)
+        other = socket.create_connection(server.getsockname())  # of the round trip
+        writer = ServoWriter(SETTINGS, clock)
+        writer.arm(state(runtime_state=STOPPED), lambda: None)
+        other.close()
+        for _ in range(50):
+            writer.keep_alive()
+            writer.write(setpoint(), state())
+            clock.sleep(CYCLE)
+        connect()
+        opened[0].close()
+        clock.sleep(KICK + CYCLE)
+        with pytest.raises(WriteError, match="ended and was replaced: the robot's watchdog"):
+            writer.keep_alive()
+        opened[1].close()
 
 
 @pytest.mark.parametrize("also", [set[str](), {"servoStop"}])
