@@ -29,6 +29,7 @@ from gapbridge.drivers.profile_file import ProfileError
 FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have reported everything once
 SLICE = 0.02  # s, of one wait for a frame
 ANSWER = 0.02  # s after which an answer that is not there does not come
+OLDEST_HOLD = 0.2  # s: older joints are not where the arm is to be held
 
 
 class CanDriver(Driver):
@@ -57,6 +58,7 @@ class CanDriver(Driver):
         self._slot = 0.0  # s, monotonic: when the next request is due
         self._changed = 0.0  # s, monotonic: when the joints last changed
         self._q: Array | None = None
+        self._q_at = 0.0  # s, monotonic: when they were received
         self._angles: list[float] = []  # the same, as they were reported in the last sample
         self._broken = 0  # dropped samples that were reported
         self._pending: Sample | None = None  # received before a dropped one was reported
@@ -185,7 +187,7 @@ class CanDriver(Driver):
         """Raise StaleStateError for joints that do not change though commanded elsewhere."""
         now, target = sample.received, self.writer.target
         # lists: faster than arrays of six
-        q = sample.position.tolist()
+        q, self._q_at = sample.position.tolist(), now
         if q != self._angles:
             self._q, self._angles, self._changed = sample.position, q, now
         if self._armed_at is None or target is None:
@@ -231,11 +233,14 @@ class CanDriver(Driver):
             hold = self._near(start)
             if self.writer.target is None:
                 self.writer.write(hold)
+        except ForeignCommandError:
+            self.writer.reset()  # the arm is another's: a hold would be a goal against theirs
+            raise
         except LinkError:
             target = self.writer.target
             hold = start if target is None else target
             with contextlib.suppress(LinkError):
-                self._run_release(lambda: hold if self._is_near(start) else None)
+                self._run_release(lambda: self._held(start, hold))
             raise
         self._armed_at = self._changed = self._now()
         self._reset_reading()
@@ -243,22 +248,32 @@ class CanDriver(Driver):
     def _present(self) -> Array:
         if self._q is None:
             raise WriteError(f"{self.profile.name}: found no state, expected read_state() first")
+        if (age := self._now() - self._q_at) > OLDEST_HOLD:
+            raise WriteError(
+                f"{self.profile.name}: found joints {age:.2f} s old, expected at most "
+                f"{OLDEST_HOLD:g} s: where the arm stands is not known"
+            )
         return self._q
 
     def _near(self, start: Array) -> Array:
         """Return the present joints (n,), rad, to be held. Raises WriteError where they moved."""
         present = self._present()
-        if not self._is_near(start):
-            displacement = float(np.abs(present - start).max())
+        displacement = float(np.abs(present - start).max())
+        if not displacement <= self.settings.arming_distance:
             raise WriteError(
                 f"{self.profile.name}: the arm moved {displacement:.3f} rad when enabled"
             )
         return present
 
-    def _is_near(self, start: Array) -> bool:
-        """Return whether the joints are where enabling began: only there may they be held."""
-        displacement = float(np.abs(self._present() - start).max())
-        return displacement <= self.settings.arming_distance  # NaN is not
+    def _held(self, start: Array, hold: Array) -> Array | None:
+        """Return the joints (n,) that a refused arming holds; None: the arm is not there any more.
+
+        A hold would pull it back, without limits.
+        """
+        with contextlib.suppress(WriteError):
+            self._near(start)
+            return hold
+        return None
 
     def _listen(self, seconds: float) -> None:
         """Read for ``seconds``, sending requests where needed; updates the present joints."""
@@ -268,6 +283,7 @@ class CanDriver(Driver):
             sample = self.reader.listen(min(max(remaining, 0.001), 1.0 / self.rate))
             if sample is not None and np.isfinite(sample.position).all():
                 self._q, self._angles = sample.position, sample.position.tolist()
+                self._q_at = sample.received
             if seconds == 0.0:
                 return
 

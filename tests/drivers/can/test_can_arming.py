@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -69,14 +70,26 @@ def test_an_arm_that_was_moved_while_its_motors_were_enabled_is_not_pulled_back(
 ) -> None:
     driver, state = served.driver, next_state(served.driver)
     moved = state.actual_q.copy()
-    moved[2] += 0.5
+    moved[2] += 0.1
     served.controller.move_own(tuple(moved))  # by a person's hand
     monkeypatch.setattr(driver, "_reached", lambda _: np.abs(moved - driver._q).max() < 1e-3)
-    with pytest.raises(WriteError, match=r"the arm moved 0\.500 rad when enabled"):
+    with pytest.raises(WriteError, match=r"the arm moved 0\.\d+ rad when enabled"):
         driver.arm(state)
     next_state(driver)
     assert not goals_of_joint_3(bus)
     assert np.abs(moved - served.controller.q).max() < 1e-3
+
+
+def test_an_arm_whose_joints_are_not_heard_any_more_is_not_held_where_it_stood(
+    served: Served, bus: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driver, state = served.driver, next_state(served.driver)
+    served.nodes.withheld.add(0x2A5)  # of joints 1 and 2: no sample is complete
+    begun = time.monotonic()
+    monkeypatch.setattr(driver, "_reached", lambda _: time.monotonic() - begun > 1.0)
+    with pytest.raises(WriteError, match=r"found joints \d\.\d+ s old, expected at most 0\.2 s"):
+        driver.arm(state)
+    assert not goals_of_joint_3(bus)
 
 
 def test_an_arm_that_stands_where_it_was_is_held_by_a_refused_arming(
@@ -101,15 +114,16 @@ def test_joints_that_give_a_little_when_enabled_are_armed(
 def test_another_commander_while_the_motors_are_enabled_is_not_forgotten(
     served: Served, bus: can.BusABC, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = served.driver.writer.run
+    run, sequences = served.driver.writer.run, []
 
     def commanded(*given: Any) -> None:
-        monkeypatch.undo()  # the release runs a sequence too
+        sequences.append(given[0])
         bus.send(can.Message(arbitration_id=0x152, data=bytes(8), is_extended_id=False))
         run(*given)
 
     monkeypatch.setattr(served.driver.writer, "run", commanded)
     with pytest.raises(ForeignCommandError, match="another commander sent 0x152"):
         served.driver.arm(next_state(served.driver))
+    assert sequences == [served.driver.profile.enable], "no release: its hold would be a goal"
     with pytest.raises(WriteError, match=r"expected arm\(\) first"):
         served.driver.write_setpoint(setpoint_of(next_state(served.driver).actual_q))
