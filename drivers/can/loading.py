@@ -345,6 +345,10 @@ class _Loading:
                 readings.setdefault(message.name, []).append(Reading(signal.name, name, i))
         for i, entry in enumerate(self.file.status):
             message, signal = self.names.signal(entry.signal, ("status", i, "signal"))
+            if any(check.signal == signal.name for check in checks.get(message.name, ())):
+                raise self.names.error(
+                    ("status", i, "signal"), f"found {entry.signal} twice, expected one condition"
+                )
             check = Check(
                 signal.name, frozenset(entry.normal), dict(entry.values), entry.otherwise,
                 entry.while_writing,

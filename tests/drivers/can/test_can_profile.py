@@ -108,6 +108,11 @@ YAML = [
     ("a constant left out", "{message: GoHand, signals: {mode: 3}}", "{message: GoHand}",
      ["setpoint.frames.2.signals", "no mode"]),
     ("a constant that does not fit", "signals: {wanted: 1}", "signals: {wanted: 2}", ["Power"]),
+    ("two conditions on a signal, of which the last alone would count",
+     "  - {signal: Health.alarm, normal: [0], values: {2: emergency_stop}}",
+     "  - {signal: Health.alarm, normal: [0], values: {2: emergency_stop}}\n"
+     "  - {signal: Health.alarm, normal: [0, 1], while_writing: true}",
+     ["status.2.signal", "found Health.alarm twice"]),
     ("a stop that we do not know", "2: emergency_stop", "2: explosion", ["status.1.values"]),
     ("broken YAML", "joints: 6", "joints: [6", ["broken YAML"]),
     ("a key twice", "rate: 250", "joints: 6", ["joints: found twice"]),
