@@ -29,7 +29,7 @@ from gapbridge.drivers.profile_file import ProfileError
 FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have reported everything once
 SLICE = 0.02  # s, of one wait for a frame
 ANSWER = 0.02  # s after which an answer that is not there does not come
-OLDEST_HOLD = 0.2  # s: older joints are not where the arm is to be held
+FRESH, OLDEST_HOLD = 0.1, 0.2  # s: of reading before enabling; age of joints to be held at most
 
 
 class CanDriver(Driver):
@@ -214,7 +214,7 @@ class CanDriver(Driver):
         if not self.profile.writes:
             raise WriteError(f"{self.profile.name}: this profile is read only")
         quiet = self.settings.foreign_quiet
-        self._listen(max(self._listening + quiet - self._now(), 0.0))
+        self._listen(max(self._listening + quiet - self._now(), FRESH))
         foreign = self.reader.foreign
         if foreign is not None and self._now() - foreign.seen < quiet:
             raise self._commanded_by_another()
@@ -248,10 +248,11 @@ class CanDriver(Driver):
     def _present(self) -> Array:
         if self._q is None:
             raise WriteError(f"{self.profile.name}: found no state, expected read_state() first")
-        if (age := self._now() - self._q_at) > OLDEST_HOLD:
+        oldest = max(OLDEST_HOLD, self.settings.state_timeout)
+        if (age := self._now() - self._q_at) > oldest:
             raise WriteError(
-                f"{self.profile.name}: found joints {age:.2f} s old, expected at most "
-                f"{OLDEST_HOLD:g} s: where the arm stands is not known"
+                f"{self.profile.name}: found joints {age:.2f} s old, expected at most {oldest:g} "
+                "s: where the arm stands is not known"
             )
         return self._q
 
