@@ -168,8 +168,15 @@ def test_a_request_on_an_identifier_that_commands_hides_no_other_commander(tmp_p
     path = tmp_path / "openarm.yaml"
     path.write_text(text.replace(poll, idle))
     assert read_profile(path).control == read_profile(shipped / "openarm.yaml").control
-    path.write_text(text + "control: [0x7FF]\n")  # whoever asks is a commander
+    asked = text.replace("control: [0x101,", "control: [0x7FF, 0x101,")  # who asks is a commander
+    path.write_text(asked)
     assert (0x7FF, False) in read_profile(path).control
+
+
+@pytest.mark.parametrize("mode", [0x000, 0x100, 0x200, 0x300])
+def test_a_damiao_motor_has_a_commander_in_whichever_mode_it_is(mode):
+    control = read_profile(CanSettings.shipped / "openarm.yaml").control
+    assert {(mode + motor, False) for motor in range(1, 8)} <= control
 
 
 def test_a_negative_gear_turns_torque_too_as_a_direction_does():
