@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -89,6 +90,11 @@ class Control:
         try:
             listener.open()
         except OSError as error:
+            if error.errno == errno.EADDRINUSE:  # else the lock of the link would have been taken
+                raise InputError(
+                    f"{cell}: found another daemon that runs this cell file, with another link; "
+                    "expected one a file: end that one first, or copy the file"
+                ) from None
             detail = f"{listener.path}: {first_line(error)}, expected a socket to listen on"
             raise InputError(detail) from None
         try:

@@ -20,6 +20,8 @@ from gapbridge.bridge.daemon.runnable import require_runnable
 from gapbridge.bridge.ipc.events import Event
 from gapbridge.drivers.clock import SYSTEM
 
+TERMINAL = (signal.SIGTTIN, signal.SIGTTOU)
+"""Signals of a terminal that stop a process in the background where it reads or writes there."""
 LONGEST_OUTPUT = 1.0  # s that the end waits for a blocked terminal or pipe
 
 
@@ -32,9 +34,9 @@ def run_cell(
 ) -> int:
     """Run a cell's daemon until it is stopped, its trajectory ends or ``duration`` s are over.
 
-    Prints what happens and a summary; returns the exit code. SIGINT and SIGTERM stop it, SIGHUP
-    reads the cell file again. ``log`` gets every event. Raises InputError for a cell that cannot be
-    run, LinkError where the robot cannot be reached.
+    Prints what happens and a summary; returns the exit code. SIGINT, SIGTERM and SIGTSTP (Ctrl-Z)
+    stop it, SIGHUP reads the cell file again. ``log`` gets every event. Raises InputError for a
+    cell that cannot be run, LinkError where the robot cannot be reached.
     """
     configuration = read_configuration(cell.path)
     require_runnable(cell, configuration.settings, SYSTEM)
@@ -64,11 +66,15 @@ def _with_time(text: str) -> str:
 
 
 class _signals:  # noqa: N801
-    """Signals reach the daemon while the block lasts; only where that is possible."""
+    """Signals reach the daemon while the block lasts; only where that is possible.
+
+    None suspends it: its loop would go on to move the arm, and nobody could disarm.
+    """
 
     def __init__(self, daemon: Daemon) -> None:
         self._calls = {
-            signal.SIGINT: daemon.stop, signal.SIGTERM: daemon.stop, signal.SIGHUP: daemon.reload,
+            signal.SIGINT: daemon.stop, signal.SIGTERM: daemon.stop, signal.SIGTSTP: daemon.stop,
+            signal.SIGHUP: daemon.reload,
         }  # fmt: skip
         self._before: dict[int, Any] = {}
 
@@ -76,6 +82,8 @@ class _signals:  # noqa: N801
         if threading.current_thread() is threading.main_thread():
             for number in self._calls:
                 self._before[number] = signal.signal(number, self._handle)
+            for number in TERMINAL:
+                self._before[number] = signal.signal(number, signal.SIG_IGN)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self._calls[signal.Signals(number)]()

@@ -7,6 +7,7 @@ socket and the cell file can arm.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import socket
@@ -54,13 +55,8 @@ class ControlSocket:
         self._unread: list[socket.socket] = []
 
     def open(self) -> None:
-        """Listen; replaces the socket of a killed daemon. The caller holds the cell's lock.
-
-        Raises OSError.
-        """
-        with contextlib.suppress(FileNotFoundError):
-            if stat.S_ISSOCK(self.path.lstat().st_mode):
-                self.path.unlink()
+        """Listen; replaces the socket of a killed daemon. Raises OSError, for a running one's."""
+        remove_unused(self.path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             listener.bind(str(self.path))
@@ -147,6 +143,24 @@ class ControlSocket:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def remove_unused(path: Path) -> None:
+    """Remove the socket that a killed process has left at ``path``.
+
+    Raises OSError where a process still listens there: it could not be reached any more, and what
+    is sent to it would move or stop another arm.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            return  # nobody can listen there, as is reported then
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            probe.setblocking(False)
+            found = probe.connect_ex(str(path))
+        if found == errno.ECONNREFUSED:
+            path.unlink()
+        elif found != errno.ENOENT:
+            raise OSError(errno.EADDRINUSE, "another process listens there")
 
 
 def refusal(message: str) -> dict[str, Any]:

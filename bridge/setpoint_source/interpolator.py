@@ -51,8 +51,12 @@ class SetpointInterpolator:
         self._newest = None
 
     def begin(self, robot_q: Array) -> None:
-        """Start at the arm's joints ``robot_q`` (n,) rad."""
-        self._present, self._sampled = robot_q.copy(), self._now()
+        """Start at the newest setpoint.
+
+        The way to it from the arm's joints ``robot_q`` (n,) rad is the stream's lead-in: here it
+        would be covered in the time between two setpoints.
+        """
+        self._present, self._sampled = self._newest, self._now()
         self.restart()
 
     def restart(self) -> None:

@@ -17,12 +17,11 @@ import json
 import math
 import os
 import socket
-import stat
 from typing import ClassVar
 
 import numpy as np
 
-from gapbridge.bridge.ipc.control_socket import peer_of
+from gapbridge.bridge.ipc.control_socket import peer_of, remove_unused
 from gapbridge.bridge.setpoint_source.interpolator import InterpolatedSource
 from gapbridge.bridge.setpoint_source.source import SourceContext
 from gapbridge.core.errors import RunError
@@ -153,9 +152,7 @@ class PlannerSource(InterpolatedSource):
         path = self.settings.socket
         if path is None:
             raise OSError("no path, expected setpoints.socket")
-        with contextlib.suppress(FileNotFoundError):  # left by a killed loop
-            if stat.S_ISSOCK(path.lstat().st_mode):
-                path.unlink()
+        remove_unused(path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         mask = os.umask(0o177)  # no other user can connect before a chmod
         try:

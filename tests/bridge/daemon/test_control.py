@@ -14,7 +14,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from clock_by_hand import ByHand
@@ -147,6 +147,39 @@ def test_a_connection_that_cannot_be_accepted_does_not_end_the_socket(
         control.open()
     with contextlib.closing(control):
         assert ask_socket(path, "disarm") == "disarm"
+
+
+def test_the_socket_of_a_killed_daemon_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "x.sock"
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(path))
+    with ControlSocket(path, lambda command, _: {"ok": True, "answer": command}, SYSTEM):
+        assert ask_socket(path, "disarm") == "disarm"
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_the_socket_of_a_running_daemon_stays_its_own(tmp_path: Path, busy: bool) -> None:
+    """Of the same cell file with another link: neither could be disarmed any more."""
+    cell = tmp_path / "cell.yaml"
+    path = runtime_folder() / f"{cell_key(cell)}.sock"
+    second = control.Control(cast("Any", None), SYSTEM)
+    with contextlib.ExitStack() as stack:
+        if busy:  # it does not answer just now
+            listener = stack.enter_context(socket.socket(socket.AF_UNIX))
+            listener.bind(str(path))
+            listener.listen(1)
+            for _ in range(3):
+                waiting = stack.enter_context(socket.socket(socket.AF_UNIX))
+                waiting.setblocking(False)
+                waiting.connect_ex(str(path))
+        else:
+            stack.enter_context(
+                ControlSocket(path, lambda command, _: {"ok": True, "answer": command}, SYSTEM)
+            )
+        with pytest.raises(InputError, match="another daemon that runs this cell file"):
+            stack.enter_context(second.socket(cell))
+        assert path.exists()
+        assert busy or ask_socket(path, "disarm") == "disarm"
 
 
 def test_a_thread_that_cannot_be_started_does_not_end_the_socket(

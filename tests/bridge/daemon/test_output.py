@@ -11,12 +11,13 @@ import termios
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from daemon_cell import Robot, ask_again
 from patience import PATIENCE, wait_for
 
-from gapbridge.bridge.daemon import output
+from gapbridge.bridge.daemon import output, run
 from gapbridge.bridge.daemon.output import Output
 from gapbridge.drivers.clock import SYSTEM
 
@@ -80,7 +81,7 @@ def test_a_terminal_stopped_by_ctrl_s_keeps_no_disarm_waiting(robot: Robot) -> N
     cell = robot.cell()
     ours, theirs = pty.openpty()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    run = subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-m", "gapbridge", "run", str(cell)], cwd=robot.folder, env=environment,
         stdout=theirs, stderr=theirs,
     )  # fmt: skip
@@ -89,11 +90,31 @@ def test_a_terminal_stopped_by_ctrl_s_keeps_no_disarm_waiting(robot: Robot) -> N
         termios.tcflow(theirs, termios.TCOOFF)  # as Ctrl-S does
         assert ask_again(cell, "arm") == "compensating"
         assert ask_again(cell, "disarm").endswith(("observing", "observing already"))
-        run.send_signal(signal.SIGTERM)
-        assert run.wait(30.0) == 0
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30.0) == 0
     finally:
         termios.tcflow(theirs, termios.TCOON)
-        run.kill()
-        run.wait()
+        process.kill()
+        process.wait()
         os.close(ours)
         os.close(theirs)
+
+
+def test_no_terminal_suspends_a_daemon_whose_loop_would_go_on() -> None:
+    """Ctrl-Z, and a background process on a terminal with tostop: nobody could disarm the arm."""
+    calls: list[str] = []
+
+    class Stopped:
+        def stop(self) -> None:
+            calls.append("stop")
+
+        def reload(self) -> None:
+            calls.append("reload")
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGTSTP, *run.TERMINAL)}
+    with run._signals(cast("Any", Stopped())):
+        for number in before:
+            assert signal.getsignal(number) is not signal.SIG_DFL  # else this process stops here
+            signal.raise_signal(number)
+        assert calls == ["stop"]
+    assert {number: signal.getsignal(number) for number in before} == before

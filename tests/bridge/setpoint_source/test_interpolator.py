@@ -69,3 +69,18 @@ def test_lines_in_packets_move_the_arm_as_evenly_as_lines_on_time() -> None:
     arrivals = 0.04 * np.ceil(wanted / 0.04 - 1e-9)
     found = speeds(arrivals, wanted)
     assert found[60:] == pytest.approx(SPEED, rel=1e-2)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.00005, 2 * CYCLE])
+def test_the_way_from_the_arm_to_the_first_setpoint_is_left_to_the_lead_in(late: float) -> None:
+    """Also where a second line has come before the first cycle, or that cycle was late."""
+    clock = ByHand()
+    interpolator = SetpointInterpolator(1.0, "line", 1.0 / CYCLE, clock)
+    arm, there = np.zeros(1), np.full(1, 0.019)
+    interpolator.take(there)
+    interpolator.begin(arm)
+    clock.now += late
+    if late:
+        interpolator.take(there)
+        interpolator.restart()
+    assert interpolator.sample() == pytest.approx(there)

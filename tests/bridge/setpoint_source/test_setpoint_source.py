@@ -350,6 +350,17 @@ def test_the_socket_of_a_loop_that_was_killed_is_replaced(tmp_path: Path) -> Non
     source.close()
 
 
+def test_the_socket_of_a_running_loop_is_not_replaced(feed: PlannerSource) -> None:
+    """Else the planner of one arm would move another, as with two cells and one ``socket``."""
+    second = PlannerSource(SourceContext(feed.settings, 3, True, Path(), RATE, SYSTEM))
+    with pytest.raises(RunError, match="another process listens there"):
+        second.open()
+    second.close()
+    with planner(feed) as link:
+        link.sendall(GOOD)
+        assert first_of(feed) is not None
+
+
 def test_another_users_process_is_refused(
     feed: PlannerSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
