@@ -29,7 +29,7 @@ from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.daemon.side_processes import SideProcesses
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
-from gapbridge.bridge.daemon.summary import RunSummary, Tally, places
+from gapbridge.bridge.daemon.summary import Faults, RunSummary, Tally, places
 from gapbridge.bridge.daemon.zero_watch import ZeroWatch
 from gapbridge.bridge.document.output_file import private, require_folder
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
@@ -103,7 +103,7 @@ class Daemon:
         self.control = Control(self, clock)
         self.loop: LoopProcess | None = None
         self._failure: Event = {}
-        self._faults: list[tuple[str, str]] = []  # cause, text
+        self._faults = Faults()
         self.lost_rows = 0  # cycles that the recorder has lost
         self._refused = False  # arming was requested and refused
         self._has_state = False  # a state has been read in this run
@@ -454,7 +454,7 @@ class Daemon:
             self._say(text)
             self._refused |= event["cause"] == Cause.START_REFUSED
             if detail:
-                self._faults.append((event["cause"], text))
+                self._faults.add(event["cause"], text)
         elif detail and kind not in NOT_SHOWN:
             self._say(detail)
 
@@ -479,7 +479,7 @@ class Daemon:
         self._fault("loop", detail)
 
     def _fault(self, cause: str, detail: str) -> None:
-        self._faults.append((cause, detail))
+        self._faults.add(cause, detail)
         self.event_log.add({"kind": EventKind.FAULT, "cause": cause, "detail": detail})
 
     def _summary(self) -> RunSummary:
@@ -490,11 +490,11 @@ class Daemon:
             **self.tally.figures(),
             restarts=self.restarts,
             lost_rows=self.lost_rows,
-            faults=tuple(text for _, text in self._faults),
+            faults=self._faults.texts,
             state=state.name.lower(),
             exit_code=1 if failed else 0,
             recording=self.recording,
-            cause=self._faults[0][0] if self._faults else "",
+            cause=self._faults.cause,
         )
         self.event_log.add({"kind": EventKind.SUMMARY, "summary": summary.to_json()})
         return summary

@@ -56,8 +56,9 @@ class Requests:
     def forward(self) -> None:
         """Pass requests to the loop, each after an event that names the requester.
 
-        Only this method writes an ARM command.
+        Only this method writes an ARM command. Each call is a heartbeat for the loop.
         """
+        self._commands.beat()
         while not self._waiting.empty():
             number, command, by, known = self._waiting.get()
             name = "arm" if command == Command.ARM else "disarm"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from gapbridge.core.arrays import Array
 
 UNIT = 1e-6  # s: bin of a histogram
 BATCH = 50  # batches of rows that are counted together
+MOST_FAULTS = 20  # texts kept of the first faults of a run, and of the last ones
 BINS = 50_000  # to 50 ms; longer durations count in the last bin
 
 
@@ -40,6 +42,31 @@ class Histogram:
             return 0.0
         index = int(np.searchsorted(np.cumsum(self._counts), share * total))
         return min((index + 1) * UNIT, self.largest)
+
+
+class Faults:
+    """The faults of a run: a link that is lost for days is lost thousands of times."""
+
+    def __init__(self) -> None:
+        self.cause = ""  # of the first one
+        self._first: list[str] = []
+        self._last: deque[str] = deque(maxlen=MOST_FAULTS)
+        self._left_out = 0
+
+    def add(self, cause: str, text: str) -> None:
+        """Take a fault."""
+        self.cause = self.cause or cause
+        if len(self._first) < MOST_FAULTS:
+            self._first.append(text)
+            return
+        self._left_out += len(self._last) == MOST_FAULTS
+        self._last.append(text)
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Return the first and the last ones, and in between how many others there were."""
+        between = [f"{self._left_out} others"] if self._left_out else []
+        return (*self._first, *between, *self._last)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
 One word for each command holds the number of its last request; numbers only grow, over all
 processes of the loop. So no command overwrites another and none has to be cleared: the loop
 compares each word with the last number it has received, and reports that number
-(SharedMemory.note_taken). A STOP stays in force until its process of the loop has ended.
+(SharedMemory.note_taken). A STOP stays in force until its process of the loop has ended. One more
+word is the daemon's heartbeat: a loop without it can be stopped by nobody.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ class Command(IntEnum):
     RAMP_OUT = 3  # ramp out and observe; acknowledges nothing
     STOP = 4  # ramp out and end
     ZERO_MOVED = 5  # ramp out, observe, and refuse to arm until a person sends a later DISARM
+
+
+_BEATS = 1 + max(Command)  # word of the heartbeat
 
 
 class CommandMemory:
@@ -57,9 +61,13 @@ class CommandMemory:
         """Return the number of the last request written for a command; 0: none."""
         return int(self._words[command])
 
+    def beat(self) -> None:
+        """Report that requests are being passed on."""
+        self._words[_BEATS] += 1
+
     def close(self) -> None:
         """Unmap and close the memory."""
-        self._words = np.zeros(1 + max(Command), np.int64)
+        self._words = np.zeros(1 + _BEATS, np.int64)
         self._map.close()
         os.close(self.fd)
 
@@ -78,12 +86,17 @@ class Commands:
         """Return the number of the last request received for a command, ``after`` before it."""
         return self._taken_numbers[command]
 
+    @property
+    def beats(self) -> int:
+        """Return the daemon's heartbeats so far; 0 before the first."""
+        return int.from_bytes(self._map[_WORD * _BEATS :][:_WORD], sys.byteorder)
+
     def take(self) -> list[Command]:
         """Return the commands since the last call, in the order of their requests.
 
         An ARM older than a request received before is dropped: the later request wins.
         """
-        words = self._map[: _WORD * (1 + max(Command))]
+        words = self._map[: _WORD * _BEATS]
         if words == self._last_words:
             return []
         self._last_words = words

@@ -47,6 +47,7 @@ from gapbridge.drivers.robot_modes import why_not_ready
 
 STOP_TIMEOUT = 1.0  # s from a stop request to the release, plus the ramp at the cell's rates
 STOP_RAMP_TIME = 0.5  # s: longest ramp when stopping
+DAEMON_SILENT = 5.0  # s without a heartbeat of the daemon, after which nobody could disarm
 
 UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and not (completely) sent
 
@@ -115,6 +116,7 @@ class Loop:
         )  # fmt: skip
         self._zero_moved = False  # reported by the daemon, not acknowledged
         self._acknowledged = False  # the fault is; it ends when the robot is ready
+        self._beats, self._beaten = 0, 0.0  # of the daemon; s, monotonic: of the last one
         self._stop_by: float | None = None  # s, monotonic
         self._exit: Exit | None = None
         self._stop_requested = False
@@ -163,6 +165,7 @@ class Loop:
                     self._on_zero_moved()
             if requests:
                 self._memory.note_taken(commands.last_taken)
+            self._watch_daemon(commands.beats)
             if self._stop_requested or commands.stop:
                 self._stop()
             has_states = self._memory.has_state and self._checks.rate.known
@@ -209,6 +212,15 @@ class Loop:
                 "the cell that moves the TCP under what acts now"
             )
         return ""
+
+    def _watch_daemon(self, beats: int) -> None:
+        """Ramp out where the daemon stands still: it passes no disarming on."""
+        now = self._now()
+        if beats != self._beats or not beats:
+            self._beats, self._beaten = beats, now
+        elif now - self._beaten > DAEMON_SILENT:
+            detail = f"no heartbeat of the daemon for {DAEMON_SILENT:g} s: nobody could disarm"
+            self._supervisor.take(Cause.DAEMON_SILENT, detail)
 
     def _on_zero_moved(self) -> None:
         """Ramp out: the zero of a joint has moved, so that every pose is wrong."""

@@ -34,6 +34,7 @@ class Cause(StrEnum):
     FOREIGN = "another commander"
     INEFFECTIVE = "write without effect"
     ZERO_MOVED = "zero moved"
+    DAEMON_SILENT = "daemon silent"
     SILENCE = "silence"
     UNSAFE = "robot not ready"
     WRITE_FAILED = "write failed"
@@ -50,7 +51,7 @@ STOPS_AT_ONCE = (_C.SILENCE, _C.UNSAFE, _C.WRITE_FAILED, _C.BAD_OUTPUT)
 RAMPS_OUT = (
     _C.DISARM, _C.STOP, _C.SOURCE_DRY, _C.SETPOINT_REFUSED, _C.STALE, _C.IMPLAUSIBLE, _C.FROZEN,
     _C.RESYNC, _C.OVERRUN, _C.SATURATED, _C.UNSOLVED, _C.LOAD, _C.NOT_FOLLOWING, _C.MISMATCH,
-    _C.FOREIGN, _C.INEFFECTIVE, _C.ZERO_MOVED,
+    _C.FOREIGN, _C.INEFFECTIVE, _C.ZERO_MOVED, _C.DAEMON_SILENT,
 )  # fmt: skip
 """Causes that end compensating by a ramp."""
 

@@ -21,7 +21,7 @@ from clock_by_hand import ByHand
 from daemon_cell import Robot, Run, ask_again, gapbridge
 from patience import PATIENCE, wait_for
 from simulated_daemon import ask as ask_in_simulation
-from simulated_daemon import rides_on_a_program, until
+from simulated_daemon import causes, rides_on_a_program, until
 
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.cell.verification_mark import write_mark
@@ -31,6 +31,7 @@ from gapbridge.bridge.ipc.control_client import ask, ask_socket, running
 from gapbridge.bridge.ipc.control_socket import ControlSocket, Peer
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
+from gapbridge.bridge.loop.loop import DAEMON_SILENT
 from gapbridge.core.errors import InputError, RunError
 from gapbridge.drivers.clock import SYSTEM
 
@@ -617,3 +618,20 @@ class GivesUp(NoLoop):
 def test_an_arming_that_the_loop_gives_up_is_answered_at_once_and_says_why() -> None:
     reply = control.Control(GivesUp(), clock=SYSTEM).answer("arm", Peer(1, 2))  # type: ignore[arg-type]
     assert reply == {"ok": False, "error": "gap in time: found a gap of 0.408 s"}
+
+
+@pytest.mark.parametrize("seconds", [0.6 * DAEMON_SILENT, 3.0 * DAEMON_SILENT])
+def test_a_loop_whose_daemon_stands_still_ramps_out(seconds: float) -> None:
+    """Stopped, as by a debugger: nobody could disarm. It goes on after a short while."""
+    with rides_on_a_program() as (run, world):
+        goes_on = world.now + seconds
+        run.process.freeze(seconds)
+        world.run(world.now + DAEMON_SILENT + 2.0, lambda: False)
+        short = seconds < DAEMON_SILENT
+        assert run.state() == (State.COMPENSATING if short else State.OBSERVING)
+        until(world, lambda: world.now > goes_on + 1.0)
+        assert ("daemon silent" in causes(run)) != short
+        assert (run.daemon.state == State.COMPENSATING) == short  # and no daemon arms it again
+        if not short:
+            ask_in_simulation(run, "arm")
+        assert run.daemon.state == State.COMPENSATING

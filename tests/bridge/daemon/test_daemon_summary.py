@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gapbridge.bridge.daemon.summary import Histogram, RunSummary, Tally
+from gapbridge.bridge.daemon.summary import MOST_FAULTS, Faults, Histogram, RunSummary, Tally
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.core.state import CLAMPS, RATE, VELOCITY
 
@@ -99,3 +99,20 @@ def test_a_summary_is_json_and_reports_the_figures_in_text() -> None:
     text = "\n".join(found.lines())
     assert "cycles 2, missed 0 (0.000 %)" in text
     assert "p99 1.00 ms" in text
+
+
+@pytest.mark.parametrize("count", [0, 1, MOST_FAULTS + 1, 2 * MOST_FAULTS, 10_000])
+def test_the_faults_of_a_link_that_is_lost_for_days_fit_into_one_event(count: int) -> None:
+    """Else the recorder gets neither the summary nor the end: its pipe is full."""
+    faults = Faults()
+    for number in range(count):
+        faults.add("loop" if number else "silence", f"{number} {1000 * 'x'}")
+    assert faults.cause == ("silence" if count else "")
+    found = [text.split(" ")[0] for text in faults.texts]
+    kept = [str(number) for number in range(count)]
+    if count > 2 * MOST_FAULTS:
+        others = str(count - 2 * MOST_FAULTS)
+        assert found == [*kept[:MOST_FAULTS], others, *kept[-MOST_FAULTS:]]
+    else:
+        assert found == kept
+    assert len(json.dumps(faults.texts)) < 1 << 16  # of the smallest pipe

@@ -122,3 +122,15 @@ def test_nobody_but_the_daemon_can_write_to_it(memory: CommandMemory) -> None:
     with pytest.raises(TypeError):
         loop._map[8] = 1
     assert loop.take() == [DISARM]
+
+
+def test_a_heartbeat_is_no_request(memory: CommandMemory) -> None:
+    loop = Commands(memory.fd)
+    assert loop.beats == 0
+    memory.ask(ARM)
+    for count in (1, 2):
+        memory.beat()
+        assert loop.beats == count
+    assert loop.take() == [ARM]
+    memory.beat()
+    assert loop.take() == []

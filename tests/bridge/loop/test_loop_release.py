@@ -84,7 +84,7 @@ class Asked:
     A pair is a command and the number under which it was made earlier.
     """
 
-    stop = False
+    stop, beats = False, 0
     last_taken = 0
 
     def __init__(self, loop: Loop, script: dict[int, Any], cycles: int) -> None:

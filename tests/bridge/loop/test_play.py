@@ -91,7 +91,7 @@ class Program(Source):
 class Asked:
     """Arms once; stops after the last cycle."""
 
-    stop, last_taken = False, 0
+    stop, last_taken, beats = False, 0, 0
 
     def __init__(self, driver: NoisyArm) -> None:
         self._driver, self._armed = driver, False
