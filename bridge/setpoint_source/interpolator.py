@@ -32,10 +32,15 @@ class SetpointInterpolator:
         self._present: Array | None = None
         self._begun = self._sampled = 0.0  # s, monotonic: of the segment, of the present setpoint
 
-    def take(self, q: Array) -> None:
-        """Store a new setpoint (n,), rad."""
+    @property
+    def goal(self) -> Array | None:
+        """Return the setpoint (n,) rad that a motion goes to; None: no motion goes on."""
+        return None if self._present is None else self._newest
+
+    def take(self, q: Array, anew: bool = False) -> None:
+        """Store a new setpoint (n,), rad; ``anew``: from another sender than the last one."""
         now = self._now()
-        interval = min(now - self._last_received, MAX_INTERVAL)
+        interval = MAX_INTERVAL if anew else min(now - self._last_received, MAX_INTERVAL)
         shortened = self._length - SHORTENED * interval
         self._length = max(interval, shortened) if self._newest is not None else 0.0
         self._newest, self._last_received = q, now

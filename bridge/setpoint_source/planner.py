@@ -7,7 +7,7 @@ Writing here moves the arm, so there is no second attempt: a line that is not a 
 lines than the robot has cycles, is answered with ``error: ...`` and ends the connection. What
 arrives while the loop is busy arming is dropped unread. From its first valid line on a connection
 is the only source, until it closes, or until it has been silent for the timeout and another planner
-sends a valid line.
+sends a valid line. In a motion, that line must be near the arm, as the first one of a motion.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 from gapbridge.bridge.ipc.control_socket import peer_of, remove_unused
 from gapbridge.bridge.setpoint_source.interpolator import InterpolatedSource
 from gapbridge.bridge.setpoint_source.source import SourceContext
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import RunError
 from gapbridge.drivers.clock import Clock
 
@@ -261,15 +262,33 @@ class PlannerSource(InterpolatedSource):
             message = f"found {len(values)} numbers, expected {self.n} finite ones, rad"
             self._end(connection, message)
             return False
-        if connection is not self._planner:
-            if self._is_held:
-                connection.refuse("another planner is connected")
-                return False
-            if self._planner is not None:
-                self._planner.refuse("silent, and another planner has taken the feed")
-            self._planner = connection
+        q, anew = np.array(values), connection is not self._planner
+        if anew and not self._takes_over(connection, q):
+            return False
         connection.note_line()
-        self._interpolator.take(np.array(values))
+        self._interpolator.take(q, anew)
+        return True
+
+    def _takes_over(self, connection: Connection, q: Array) -> bool:
+        """Make a connection the planner with its first setpoint (n,) rad, or refuse it.
+
+        In a motion it begins near where the one before it has sent the arm: there is no lead-in.
+        """
+        if self._is_held:
+            connection.refuse("another planner is connected")
+            return False
+        goal, tolerance = self._interpolator.goal, self.settings.start_tolerance
+        away = 0.0 if goal is None else float(np.abs(q - goal).max())
+        if away > tolerance:
+            self._end(
+                connection,
+                f"found a first setpoint {away:.4f} rad from the one that the arm goes to, "
+                f"expected at most {tolerance:g} (setpoints.start_tolerance)",
+            )
+            return False
+        if self._planner is not None:
+            self._planner.refuse("silent, and another planner has taken the feed")
+        self._planner = connection
         return True
 
     def _end(self, connection: Connection, message: str) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clock_by_hand import ByHand
 from patience import PATIENCE
 
 from gapbridge.bridge.cell import load_cell
@@ -20,6 +21,7 @@ from gapbridge.bridge.cell.run_settings import settings_of
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.control_socket import Peer
 from gapbridge.bridge.setpoint_source import make_source
+from gapbridge.bridge.setpoint_source.interpolator import MAX_INTERVAL
 from gapbridge.bridge.setpoint_source.planner import PlannerSource
 from gapbridge.bridge.setpoint_source.source import Source, SourceContext, SourceDryError
 from gapbridge.bridge.setpoint_source.target import TargetSource
@@ -335,6 +337,40 @@ def test_the_socket_is_its_owners_and_goes_with_the_source(feed: PlannerSource) 
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     feed.close()
     assert not path.exists()
+
+
+@pytest.mark.parametrize("away", [0.015, 0.05])
+def test_in_a_motion_another_planner_goes_on_from_where_the_last_one_was(
+    tmp_path: Path, away: float
+) -> None:
+    """One that was started anew would take the armed arm to its own start at full speed."""
+    clock, cycle = ByHand(), 1.0 / RATE
+    settings = SetpointSettings(source="planner", socket=tmp_path / "p.sock")
+    source = PlannerSource(SourceContext(settings, 3, True, Path(), RATE, clock))
+    source.open()
+    with contextlib.closing(source):
+        with planner(source) as one:
+            one.sendall(GOOD)
+            assert source.first(HERE) is not None
+            source.begin(0.0, HERE)
+            assert source.sample(0.0, HERE) == pytest.approx(np.zeros(3))
+        clock.now += cycle
+        assert source.sample(0.0, HERE) == pytest.approx(np.zeros(3))
+        with planner(source) as two:
+            two.sendall(f"{away},0,0\n".encode())
+            seen = [0.0]
+            for _ in range(round(settings.timeout / cycle) - 2):
+                clock.now += cycle
+                seen.append(source.sample(0.0, HERE)[0])
+            near = away <= settings.start_tolerance
+            assert seen[-1] == pytest.approx(away if near else 0.0)
+            assert np.diff(seen).max() <= 1.1 * away / MAX_INTERVAL * cycle
+            if not near:
+                assert b"expected at most 0.02 (setpoints.start_tolerance)" in answer(two)
+                source.discard()  # armed again: a first setpoint is compared with the arm
+                with planner(source) as three:
+                    three.sendall(f"{away},0,0\n".encode())
+                    assert source.first(HERE) is not None
 
 
 def test_the_socket_of_a_loop_that_was_killed_is_replaced(tmp_path: Path) -> None:
