@@ -52,8 +52,8 @@ class SetpointInterpolator:
         return self._newest
 
     def forget(self) -> None:
-        """Wait for a new setpoint, as if none had come."""
-        self._newest = None
+        """Wait for a new setpoint, as if none had come: no motion goes on."""
+        self._newest = self._present = None
 
     def begin(self, robot_q: Array) -> None:
         """Start at the newest setpoint.

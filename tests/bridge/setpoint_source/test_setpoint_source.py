@@ -367,10 +367,12 @@ def test_in_a_motion_another_planner_goes_on_from_where_the_last_one_was(
             assert np.diff(seen).max() <= 1.1 * away / MAX_INTERVAL * cycle
             if not near:
                 assert b"expected at most 0.02 (setpoints.start_tolerance)" in answer(two)
-                source.discard()  # armed again: a first setpoint is compared with the arm
-                with planner(source) as three:
-                    three.sendall(f"{away},0,0\n".encode())
-                    assert source.first(HERE) is not None
+                source.discard()  # the motion is over
+                for q in (away, -away):
+                    with planner(source) as next_one:
+                        next_one.sendall(f"{q},0,0\n".encode())
+                        assert source.first(HERE) == pytest.approx([q, 0.0, 0.0])
+                    source.listen()
 
 
 def test_the_socket_of_a_loop_that_was_killed_is_replaced(tmp_path: Path) -> None:
