@@ -24,6 +24,7 @@ MIN_SPEED_SCALING = 0.95  # below it, an arm that we move lags behind its setpoi
 MAX_SPEED_SCALING = 2.0  # above it, the value is implausible
 MAX_GAP_CYCLES = 10.0  # cycles: after a longer gap between states, filters restart
 SETTINGS_EVERY = 1.0  # s between two checks of the controller's settings
+REPORT_EVERY = 1.0  # s between two events of a finding that comes and goes, as of a loose cable
 FROZEN_AFTER = 1.0  # s for which joints may stay bit-identical while they should move
 COMMANDED_AWAY = 2e-3  # rad: they should move if the command has moved this far,
 MOVING = 0.02  # rad/s: or if a joint reports this velocity
@@ -145,6 +146,8 @@ class LoopChecks:
         self._not_following: float | None = None  # s, controller clock: since when
         self._settings_at = -1.0  # s, controller clock: of the next look
         self._active: set[LoopCounter] = set()
+        self._shown: set[LoopCounter] = set()  # of the active ones, those that were reported
+        self._emitted: dict[LoopCounter, float] = {}  # s, controller clock
         self._last: float | None = None  # s, controller clock
         self.not_ready = "no state has been read"  # why the robot cannot move; empty: it can
 
@@ -234,20 +237,32 @@ class LoopChecks:
     def _report(self, counter: LoopCounter, detail: str | None, cause: Cause | None) -> None:
         """Notify the supervisor of a finding (``detail``); count and emit it once."""
         if detail is None:
-            if counter in self._active:
-                self._active.discard(counter)
-                if counter == LoopCounter.SENSOR_LOST:
-                    self._reports.emit(
-                        {"kind": EventKind.DEGRADED, "what": "", "detail": "the sensor is back"}
-                    )
+            self._active.discard(counter)
+            if counter in self._shown and counter == LoopCounter.SENSOR_LOST:
+                self._reports.emit(
+                    {"kind": EventKind.DEGRADED, "what": "", "detail": "the sensor is back"}
+                )
+            self._shown.discard(counter)
             return
         faulty = self._supervisor.state == State.FAULT  # the first fault is what is latched
         changed = cause is not None and not faulty and self._supervisor.take(cause, detail)
-        if counter in self._active:
+        if counter not in self._active:
+            self._active.add(counter)
+            self._reports.count(counter)
+        if counter in self._shown:
             return
-        self._active.add(counter)
-        self._reports.count(counter)
-        if not changed and self._supervisor.state != State.FAULT:
+        if changed or self._supervisor.state == State.FAULT:  # the transition reports it
+            self._shown.add(counter)
+        elif self._may_emit(counter):
+            self._shown.add(counter)
             lost = counter == LoopCounter.SENSOR_LOST
             kind = EventKind.DEGRADED if lost else EventKind.WARNING
             self._reports.emit({"kind": kind, "what": counter.label, "detail": detail})
+
+    def _may_emit(self, counter: LoopCounter) -> bool:
+        """Return whether an event of a finding is due: events that fill their socket are lost."""
+        now, last = self._last or 0.0, self._emitted.get(counter)
+        if last is not None and 0.0 <= now - last < REPORT_EVERY:
+            return False
+        self._emitted[counter] = now
+        return True

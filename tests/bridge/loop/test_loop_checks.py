@@ -221,6 +221,30 @@ def test_a_lost_sensor_is_flagged_in_every_cycle_and_reported_twice(memory: Shar
     assert memory.counts()["sensor_lost"] == 1
 
 
+@pytest.mark.parametrize("at", [State.OBSERVING, State.COMPENSATING])
+def test_what_comes_and_goes_fills_no_log_and_its_last_state_is_told(
+    memory: SharedMemory, at: State
+) -> None:
+    """A loose cable: events that do not fit into their socket, a fault's too, would be lost."""
+    bench, seconds = Bench(memory, at), 4
+    cycles = round(seconds / T)
+    for k in range(cycles):
+        more = {"sensor_lost": "silent"} if k % 2 else {}
+        bench.checks.begin(state(1.0 + k * T, **more), 0)
+        if at == State.OBSERVING:
+            bench.checks.check_loads("force 620 N" if k % 2 else None)
+    kinds = [(event["kind"], event["what"]) for event in bench.events]
+    assert 1 <= kinds.count(("degraded", "sensor_lost")) <= seconds
+    assert kinds.count(("degraded", "")) <= seconds
+    assert kinds.count(("warning", "load")) <= seconds
+    assert memory.counts()["sensor_lost"] == cycles // 2
+    for k in range(cycles, 2 * cycles):  # now it is lost for good
+        bench.checks.begin(state(1.0 + k * T, sensor_lost="silent"), 0)
+    assert bench.events[-1]["what"] == "sensor_lost"
+    bench.checks.begin(state(1.0 + 2 * cycles * T), 0)
+    assert bench.events[-1]["detail"] == "the sensor is back"
+
+
 def test_while_only_observing_a_finding_is_reported_and_changes_nothing(
     memory: SharedMemory,
 ) -> None:
