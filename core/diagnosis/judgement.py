@@ -17,7 +17,6 @@ from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.criteria import (
-    CURVATURE_GAIN,
     MAX_OUTLIER_SHARE,
     MAX_STRUCTURE_P,
     MAX_STRUCTURE_P_WITH_HINT,
@@ -49,7 +48,7 @@ from gapbridge.core.diagnosis.value_stability import (
     shifts_alike,
     stable_effects,
 )
-from gapbridge.core.effects import CATALOGUE, Parameter
+from gapbridge.core.effects import Parameter
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
@@ -284,7 +283,14 @@ def significant_alone(
         if implausible := refit.implausible_parameters(judgement.accused):
             selection = selection.with_nominal(implausible)
             continue
-        straight = _linear_with_unnamed(refit, judgement)
+        unknown = judgement.unnamed_part is not None
+        straight = refit.linear_curves(judgement.accused) if unknown else {}
+        if lines := {p: line for p, line in straight.items() if line is not None}:
+            selection = selection.with_lines(lines)
+            start = selection.terms
+            ties = {p: names for p, names in judgement.ties.items() if p not in lines}
+            judgement = replace(judgement, ties=ties)
+            continue
         significance = {
             p: 0.0 if p in straight else worth(refit.terms[p], refit.covariance[p])
             for p in judgement.accused
@@ -311,18 +317,6 @@ def significant_alone(
             ties={p: names for p, names in judgement.ties.items() if p not in weakest},
         )  # fmt: skip
         start = refit.terms
-
-
-def _linear_with_unnamed(refit: Selection, judgement: Judgement) -> set[int]:
-    """Return positions of accused stiffness curves that are linear given the unnamed functions.
-
-    By their standard deviation over the regions of the log, for which there is no likelihood.
-    """
-    return {
-        p for p in judgement.accused
-        if judgement.unnamed_part is not None and CATALOGUE[refit.terms[p].effect].has_nonlinearity
-        and refit.terms[p].values[1] ** 2 < CURVATURE_GAIN * refit.covariance[p][1, 1]
-    }  # fmt: skip
 
 
 def _missing_requirement(selection: Selection, accused: Sequence[int]) -> list[int]:

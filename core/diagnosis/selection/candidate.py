@@ -187,6 +187,11 @@ def named_columns(observation: Observation, candidate: Candidate, base: Sequence
             return by_angle
     if candidate.curve is not None:
         return _stiffness_curve_columns(observation, candidate)
+    for term in base:
+        kind = CATALOGUE[term.effect]
+        own = candidate.family in (term.effect, kind.replaces)
+        if kind.has_nonlinearity and own and term.site.joint == candidate.site.joint:
+            return _columns_beside_curve(observation, candidate, base, term)
     columns = _from_nominal(observation, candidate, base)
     mass = candidate.effect.identifiable_with
     if mass is not None and not columns.any():  # a load without mass has no centre of gravity
@@ -272,6 +277,25 @@ def _stiffness_curve_columns(observation: Observation, candidate: Candidate) -> 
     linear_part = observation.axial_columns()[:, :, i]
     softened = 1 / np.sqrt(1 + candidate.curve * moment[:, i] ** 2)
     return np.stack([linear_part, linear_part * softened[:, None]], axis=-1)
+
+
+def _columns_beside_curve(
+    observation: Observation, candidate: Candidate, base: Sequence[Term], curve: Term
+) -> Array:
+    """Return columns (N, k, d) of a joint's stiffness whose ``curve`` is in the model.
+
+    A straight line is that without the curve, and the curve is a chord from this line to its
+    values, so that both are exact and compete on their full predictions: the tangent of a curve
+    bent to half its slope is five times too short, and along it a line would follow the curve.
+    """
+    others = [t for t in base if t is not curve]
+    straight = _from_nominal(observation, candidate, others)
+    compliance, softening = curve.values
+    if candidate.family != curve.effect or not softening:
+        return straight
+    part = observation.predict(base) - observation.predict(others)
+    bend = (part - straight[..., 0] * compliance) / softening
+    return np.stack([straight[..., 0], bend], axis=-1)
 
 
 def joint_quantity(observation: Observation, i: int) -> str:

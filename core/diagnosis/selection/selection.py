@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
+    CURVATURE_GAIN,
     LARGE_SAMPLE,
     MAX_EXCESS_WITH_UNNAMED,
     MIN_SIGMAS,
@@ -34,7 +35,7 @@ from gapbridge.core.diagnosis.selection.noise import Noise
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart, refit, worth
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows, flat
-from gapbridge.core.effects import Term
+from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.estimation.least_squares import projected_out, solve
 
 
@@ -146,7 +147,8 @@ class Selection:
         A link's value several times the machining tolerance of all others has to be as significant
         as a single cause. Of single links it is the farthest one only, since others may depend on
         it. Of other effects it is what is not identifiable: it may be anything. (A tool of a UR10
-        stood 20 mm off along its axis, with a standard deviation of 47 mm.)
+        stood 20 mm off along its axis, with a standard deviation of 47 mm.) A stiffness curve is
+        none without its curvature, of which the likelihood decides.
         """
         implausible: dict[int, Mask] = {}
         single: dict[int, tuple[Mask, float]] = {}
@@ -158,7 +160,8 @@ class Selection:
             unsure = size < MIN_SIGMAS_WITH_UNNAMED * spread
             if usual is None:
                 # alone, what is not significant is no cause
-                if self.observation.channel == "position" and len(unsure) > 1 and unsure.any():
+                several = len(unsure) > 1 and not self.space.candidates[c].effect.has_nonlinearity
+                if self.observation.channel == "position" and several and unsure.any():
                     unsure &= spread > UNDETERMINED_SPREAD * self.space.candidates[c].scales
                     implausible |= {c: unsure} if unsure.any() else {}
                 continue
@@ -179,6 +182,37 @@ class Selection:
         return replace(self, nominal=self.nominal | {
             c: own | self.nominal.get(c, False) for c, own in numbers.items()
         })  # fmt: skip
+
+    def linear_curves(self, positions: Iterable[int]) -> dict[int, int | None]:
+        """Return stiffness curves that are linear, with the candidate of the axial compliance.
+
+        By the standard deviation of the curvature, over the regions of the log, for which there is
+        no likelihood. None: axial compliance is no candidate.
+        """
+        linear: dict[int, int | None] = {}
+        for p in positions:
+            term, effect = self.terms[p], CATALOGUE[self.terms[p].effect]
+            if not effect.has_nonlinearity:
+                continue
+            if term.values[1] ** 2 < CURVATURE_GAIN * self.covariance[p][1, 1]:
+                linear[p] = next((
+                    c for c, k in enumerate(self.space.candidates)
+                    if k.family == effect.replaces and k.site.joint == term.site.joint
+                ), None)  # fmt: skip
+        return linear
+
+    def with_lines(self, lines: Mapping[int, int]) -> Selection:
+        """Return the selection with axial compliances (candidates) for curves (positions)."""
+        terms, index, covariance = list(self.terms), list(self.term_index), list(self.covariance)
+        for p, line in lines.items():
+            terms[p] = self.space.candidates[line].term(np.array(terms[p].values[:1]))
+            index[p], covariance[p] = line, covariance[p][:1, :1]
+        instead = dict(zip(self.term_index, index, strict=True))
+        best = fit(self.working, [instead.get(c, c) for c in self.best.chosen])
+        return replace(
+            self, terms=tuple(terms), term_index=tuple(index), covariance=tuple(covariance),
+            best=best,
+        )  # fmt: skip
 
     def without_links(self) -> Selection:
         """Return the selection without the links' geometry as a cause."""

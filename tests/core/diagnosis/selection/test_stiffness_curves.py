@@ -13,9 +13,15 @@ from gapbridge.core.log.log import read_log
 
 @pytest.mark.parametrize(
     ("kind", "seed", "cause"),
-    [*further(("mixed:3", 1060004, ("stiffness_nonlinearity", (2,)))),
-     ("axial_compliance", 1090000, None)],
-)  # fmt: skip
+    [
+        *further(("mixed:3", 1060004, ("stiffness_nonlinearity", (2,)))),
+        ("axial_compliance", 1090000, None),
+        # a line beside the curve in the model followed it, and the search went on between the two
+        ("size:stiffness_nonlinearity@2", 1620001, ("stiffness_nonlinearity", (2,))),
+        # its curvature, 3.9 sigmas, was held nominal as a number that the log does not determine
+        ("size:stiffness_nonlinearity@2", 1620004, ("stiffness_nonlinearity", (1,))),
+    ],
+)
 def test_a_curve_with_a_sigma_of_a_third_is_accused_and_a_line_is_kept_linear(
     kind: str, seed: int, cause: tuple[str, tuple[int, ...]] | None, tmp_path
 ) -> None:
