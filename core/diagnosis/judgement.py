@@ -287,9 +287,14 @@ def significant_alone(
         straight = refit.linear_curves(judgement.accused) if unknown else {}
         if lines := {p: line for p, line in straight.items() if line is not None}:
             selection = selection.with_lines(lines)
+            anew = judge(selection, HeldOut(selection))
+            out = {p for p, _ in judgement.withdrawn}
+            withdrawn = tuple((p, why) for p, why in anew.withdrawn if p not in out)
+            judgement = replace(
+                anew, accused=tuple(p for p in anew.accused if p not in out),
+                withdrawn=(*judgement.withdrawn, *withdrawn), stand_ins=judgement.stand_ins,
+            )  # fmt: skip
             start = selection.terms
-            ties = {p: names for p, names in judgement.ties.items() if p not in lines}
-            judgement = replace(judgement, ties=ties)
             continue
         significance = {
             p: 0.0 if p in straight else worth(refit.terms[p], refit.covariance[p])

@@ -43,3 +43,13 @@ def test_the_curve_of_a_wrist_is_not_pulled_to_that_of_a_shoulder(tmp_path) -> N
     assert {p.name for p in cause.parameters} == set(truth)
     for parameter in cause.parameters:
         assert abs(parameter.value - truth[parameter.name]) < 3 * parameter.std
+
+
+def test_a_curve_that_is_linear_over_the_regions_is_judged_anew_as_a_line(tmp_path) -> None:
+    """As a line its value depends on an angle: part of an unknown effect."""
+    truth = make_case("mixed:3", 1630002, tmp_path)
+    cell = load_cell(tmp_path / "cell.yaml")
+    found = diagnose(cell.model, read_log(tmp_path / "log.csv", cell.arm.n), cell.metrology)
+    (channel,) = [c for c in found.channels if c.channel == "position"]
+    assert {c.effect for c in channel.causes} == set(truth.effects)
+    assert channel.structured
