@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from contract_checks import OFFSET, next_state, setpoint_of, stream
 from contract_modbus import INVENTED, ModbusCase
-from patience import wait_for
+from patience import PATIENCE, wait_for
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.errors import LinkError, WriteError
@@ -42,8 +42,12 @@ def program_of(case: ModbusCase) -> MailboxProgram:
 def test_the_robot_takes_offsets_out_when_the_heartbeat_stops() -> None:
     with ModbusCase("ur", watchdog=2.0) as ur, ur.driver() as driver:
         driver.arm(next_state(driver))
-        stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.6)
-        assert max(map(abs, program_of(ur).applied)) > 1e-4
+
+        def moved() -> bool:
+            return max(map(abs, program_of(ur).applied)) > 1e-4
+
+        stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), PATIENCE, moved)
+        assert moved()
         driver.transport.close()  # as if the process had died: nothing is released
         wait_for(lambda: not any(program_of(ur).applied), "the watchdog")
 
@@ -61,7 +65,7 @@ def test_a_program_that_ends_while_offsets_flow_is_noticed(ur: ModbusCase) -> No
         stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.3)
         program_of(ur).running = False
         with pytest.raises(WriteError, match=r"offsets do not arrive.*absent"):
-            stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 2.0)
+            stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), PATIENCE)
 
 
 def test_a_mailbox_whose_checksum_is_wrong_is_not_applied(ur: ModbusCase) -> None:
@@ -201,7 +205,7 @@ def test_a_target_that_the_robot_refuses_is_reported(monkeypatch: pytest.MonkeyP
 
         monkeypatch.setattr(case.controller, "move_own", refuse)
         with pytest.raises(WriteError, match=r"last command .*found 2, expected 0 or 1"):
-            stream(driver, lambda state, _: setpoint_of(state, q, q, (0.0,) * 6), 2.0)
+            stream(driver, lambda state, _: setpoint_of(state, q, q, (0.0,) * 6), PATIENCE)
 
 
 def test_the_wrong_controller_is_reported_when_connecting() -> None:
