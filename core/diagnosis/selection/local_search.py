@@ -14,7 +14,8 @@ from gapbridge.core.diagnosis.selection.forward_selection import (
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.estimation.least_squares import inverse, squared_sigmas
 
-MAX_MERGED = 9  # terms up to which every pair may be replaced by one
+MAX_MERGED = 9  # terms up to which pairs are replaced by one, and each by several
+MAX_EXCHANGED = 4  # terms exchanged for others at most
 MAX_ADDED = 30  # terms added to a set at most
 
 
@@ -100,13 +101,36 @@ def joined_sets(space: SampleSpace, current: CandidateFit) -> list[CandidateFit]
     return sets
 
 
+def exchanged(space: SampleSpace, current: CandidateFit) -> CandidateFit:
+    """Return a small set after exchanging single terms for others while the score improves.
+
+    What a term leaves when it is taken out may need several others: an inertia and a torque
+    constant may stand for a payload and another torque constant.
+    """
+    for _ in range(MAX_EXCHANGED):
+        better = current
+        if len(current.chosen) > MAX_MERGED:
+            break
+        for c in current.chosen:
+            others = fit(space, tuple(o for o in current.chosen if o != c))
+            trial = pruned(space, forward_selected(space, others, True, without=c))
+            better = min([better, trial], key=lambda f: f.score)
+        if better.score >= current.score - 1e-6:
+            break
+        current = better
+    return current
+
+
 def forward_selected(
-    space: SampleSpace, current: CandidateFit, named_only: bool = False
+    space: SampleSpace, current: CandidateFit, named_only: bool = False, without: int = -1
 ) -> CandidateFit:
-    """Return the set after adding the best terms one by one while the score improves."""
+    """Return the set after adding the best terms one by one while the score improves.
+
+    ``without``: a candidate that is not added.
+    """
     state = projected(space, current.chosen)
     for _ in range(MAX_ADDED):
-        nearest = additions(space, state, 1, named_only)
+        nearest = [a for a in additions(space, state, 2, named_only) if a[1] != without]
         if not nearest or nearest[0][0] >= current.score:
             break
         better = fit(space, (*current.chosen, nearest[0][1]))

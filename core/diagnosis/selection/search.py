@@ -22,6 +22,7 @@ from gapbridge.core.diagnosis.selection.forward_selection import (
     projected,
 )
 from gapbridge.core.diagnosis.selection.local_search import (
+    exchanged,
     forward_selected,
     improve,
     joined_sets,
@@ -90,8 +91,8 @@ def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
         best = min([best, pruned(space, again)], key=lambda f: f.score)
     extended = [fit(space, (*best.chosen, c)) for _, c in joining(space, best.chosen, 4)]
     nearest = min([best, *extended], key=lambda f: f.score)
-    if nearest.score < best.score:  # an unnamed function may let further named causes in
-        return forward_selected(space, nearest, named_only=True)
+    if nearest.score < best.score:
+        return exchanged(space, forward_selected(space, nearest, named_only=True))
     return min([best, *joined_sets(space, best)], key=lambda f: f.score)
 
 

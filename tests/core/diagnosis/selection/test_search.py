@@ -9,7 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapbridge.core.diagnosis.selection.forward_selection import exclusive
-from gapbridge.core.diagnosis.selection.local_search import improve, pruned, rivals
+from gapbridge.core.diagnosis.selection.local_search import (
+    forward_selected,
+    improve,
+    pruned,
+    rivals,
+)
 from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.search import (
     part,
@@ -69,6 +74,22 @@ def test_a_large_log_shows_many_causes():
     planted = (0, 2, 4, 7, 9, 11, 12, 13)
     space = toy.random_space(1, FAMILIES, rows=900, planted=planted, size=0.5)
     assert set(search(space).chosen) == set(planted)
+
+
+def test_two_causes_that_together_stand_for_two_others_are_exchanged():
+    """Beside an unknown effect of a large log; no single exchange improves the score."""
+    drawn = toy.random_space(5, FAMILIES, rows=900, planted=(0, 1, 16))
+    X = drawn.X.copy()
+    X[:, 2] = X[:, 0] + X[:, 1] + X[:, 3]
+    X[:, 3] += 0.15 * np.random.default_rng(6).normal(size=900)
+    space = toy.space_of(FAMILIES, drawn.y, X)
+    imitated = forward_selected(space, fit(space, (16,)))
+    assert set(imitated.chosen) == {2, 3, 16}
+    for c in imitated.chosen:
+        others = tuple(o for o in imitated.chosen if o != c)
+        trials = [fit(space, (*others, o)) for o in range(NAMED) if o not in imitated.chosen]
+        assert min(t.score for t in trials) > imitated.score
+    assert set(search(space).chosen) == {0, 1, 16}
 
 
 def test_an_unnamed_function_wins_only_where_no_cause_does_its_work():
