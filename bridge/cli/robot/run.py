@@ -33,7 +33,8 @@ def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) 
     """Run the on-cell daemon: read the arm's state, predict how it bends, correct its setpoints.
 
     Setpoints are written if the cell has `setpoints.arm: true`, with --arm, or after
-    `gapbridge arm CELL`. SIGHUP reads the cell file again; SIGTERM ramps out and ends.
+    `gapbridge arm CELL`. SIGHUP reads the cell file again; SIGTERM, Ctrl-C and a closed terminal
+    ramp out and end it.
 
     Example: gapbridge run cell.yaml --observe --duration 60
     """

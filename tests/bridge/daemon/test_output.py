@@ -118,3 +118,52 @@ def test_no_terminal_suspends_a_daemon_whose_loop_would_go_on() -> None:
             signal.raise_signal(number)
         assert calls == ["stop"]
     assert {number: signal.getsignal(number) for number in before} == before
+
+
+SIGNALLED = """\
+import os, signal, sys
+from gapbridge.bridge.daemon.run import _signals
+
+if sys.argv[2] == "nohup":
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+os.open(sys.argv[1], os.O_RDWR)  # a session's leader: its controlling terminal
+
+class Daemon:
+    stop = lambda self: print("stop", flush=True)
+    reload = lambda self: print("reload", flush=True)
+    note = lambda self, event: print(event["detail"], flush=True)
+
+with _signals(Daemon()):
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize(
+    ("started", "hangs_up"),
+    [("at a terminal", ["its terminal is gone: it ends", "stop"]), ("nohup", ["reload"])],
+)
+def test_a_terminal_that_is_lost_ends_a_run_and_any_other_hangup_is_a_reload(
+    started: str, hangs_up: list[str]
+) -> None:
+    """The arm would compensate on, with whatever the cell file holds then, seen by nobody."""
+    ours, theirs = pty.openpty()
+    name = os.ttyname(theirs)
+    process = subprocess.Popen(
+        [sys.executable, "-c", SIGNALLED, name, started], start_new_session=True, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    with process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        said = process.stdout
+        try:
+            assert said.readline() == "ready\n"
+            process.send_signal(signal.SIGHUP)  # of kill: the terminal is there
+            assert said.readline() == "reload\n"
+            os.close(theirs)
+            os.close(ours)
+            for line in hangs_up:
+                assert said.readline().strip() == line
+        finally:
+            process.stdin.close()
