@@ -34,6 +34,7 @@ from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.state import StateBuilder, not_following, positions, states
 from gapbridge.drivers.canopen.sync_set import SyncSet
 from gapbridge.drivers.clock import Clock
+from gapbridge.drivers.controller_facts import Difference
 from gapbridge.drivers.driver import Driver
 
 log = logging.getLogger("drivers.canopen")
@@ -91,6 +92,7 @@ class CanopenDriver(Driver):
                 check_identity(master, self.profile, node)
                 master.command(node, "PRE-OPERATIONAL")
                 set_up(master, self.profile, node, self._period)
+            self.power.look()
             check_units(master, self.profile, self._arm)
             assert master.heartbeats is not None
             master.heartbeats.started()
@@ -193,6 +195,10 @@ class CanopenDriver(Driver):
                 f"{self.profile.name}: joints have not changed for {now - self._moved_at:.2f} s, "
                 f"commanded {away:.3f} rad away"
             )
+
+    def differences(self, state: RobotState) -> list[Difference]:
+        """See Driver.differences; what no drive's own settings show is one, too."""
+        return [*super().differences(state), *self.power.doubts()]
 
     # -- writing ----------------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from gapbridge.drivers.canopen.objects import (
 from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.state import not_following, positions, states
 from gapbridge.drivers.canopen.sync_set import SyncSet
+from gapbridge.drivers.controller_facts import Difference
 
 MODES_OF_OPERATION, CONSUMER_HEARTBEAT = Address(0x6060, 0), Address(0x1016, 1)
 ABORT_CONNECTION = Address(0x6007, 0)
@@ -47,12 +48,36 @@ class Power:
         self._exchange, self._now = exchange, master.clock.monotonic
         self._modes: dict[int, int] = {}  # node -> Modes of operation before
         self._values: dict[tuple[int, Address], int] = {}  # node, object -> its value before
+        self._unstoppable: list[int] = []  # nodes that cannot be told what to do at our loss
 
     @property
     def following(self) -> int:
         """Return the Controlword of a drive that follows setpoints."""
         interpolated = self._profile.file.mode == "interpolated position"
         return ENABLE_OPERATION | (ENABLE_INTERPOLATION if interpolated else 0)
+
+    def look(self) -> None:
+        """Find the drives without an abort connection option. Raises LinkError."""
+        master, profile = self._master, self._profile
+        self._unstoppable = [
+            node for node in profile.nodes
+            if profile.heartbeat.drives_wait
+            and master.read_where_present(node, ABORT_CONNECTION) is None
+        ]  # fmt: skip
+
+    def doubts(self) -> list[Difference]:
+        """Return what speaks against arming, and does not forbid it."""
+        if not self._unstoppable:
+            return []
+        nodes = ", ".join(map(str, self._unstoppable))
+        return [
+            Difference(
+                ("link", "profile"),
+                f"no 0x6007 in node {nodes}: what it does when our heartbeat ends is not known",
+                "a drive that can be told to make a quick stop then",
+                sure=False,
+            )
+        ]
 
     def check_modes(self, sample: SyncSet) -> None:
         """Refuse a drive that somebody left enabled in another mode. Raises LinkError.

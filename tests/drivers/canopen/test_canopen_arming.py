@@ -13,7 +13,8 @@ from patient_drives import patient
 
 from gapbridge.core.errors import ForeignCommandError, WriteError
 from gapbridge.drivers.canopen.driver import CanopenDriver
-from gapbridge.drivers.canopen.objects import ENABLE_OPERATION
+from gapbridge.drivers.canopen.master import Master
+from gapbridge.drivers.canopen.objects import ENABLE_OPERATION, Address
 from gapbridge.drivers.canopen.power import (
     ABORT_CONNECTION,
     CONSUMER_HEARTBEAT,
@@ -137,3 +138,21 @@ def test_another_master_while_the_drives_are_enabled_is_not_forgotten(
     with pytest.raises(ForeignCommandError, match="another master sent SDO request to node 1"):
         driver.arm(settled(driver))
     assert Phase.ENABLED not in phases(arm)
+
+
+def test_drives_that_cannot_be_told_to_stop_at_our_loss_are_warned_of(
+    arm: DriveArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without 0x6007 they may hold, or go on, when our heartbeat ends."""
+    read = Master.read_where_present
+
+    def without_option(master: Master, node: int, address: Address) -> int | None:
+        return None if (node, address) == (3, ABORT_CONNECTION) else read(master, node, address)
+
+    with arm.driver() as driver:
+        assert driver.arm(settled(driver)) == []
+    monkeypatch.setattr(Master, "read_where_present", without_option)
+    with arm.driver() as driver:
+        (warned,) = driver.arm(settled(driver))
+    assert "link.profile: found no 0x6007 in node 3" in str(warned)
+    assert not warned.sure
