@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import os
 import queue
-import subprocess
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.run_settings import Configuration, configuration_for
@@ -31,7 +30,6 @@ from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import Faults, RunSummary, Tally, places
 from gapbridge.bridge.daemon.zero_watch import ZeroWatch
-from gapbridge.bridge.document.output_file import private, require_folder
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.events import Event, EventKind, EventLog
 from gapbridge.bridge.ipc.loop_counters import DROPPED
@@ -40,7 +38,7 @@ from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory
 from gapbridge.bridge.loop.loop import STOP_TIMEOUT, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_ramp_out
 from gapbridge.bridge.loop.supervisor import Cause
-from gapbridge.bridge.recording.folder import LOOP_LOG, new_session
+from gapbridge.bridge.recording.folder import RunFiles
 from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.controller_address import address_of
@@ -80,7 +78,7 @@ class Daemon:
         self._commands = CommandMemory()  # one for the whole run; only the daemon can write
         self._last_taken = 0
         self._reader = self.memory.reader()
-        self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
+        self._files = RunFiles(settings.recording.folder, clock)
         self.side_processes = SideProcesses(clock)
         self.tally = Tally(n, settings.link.rate)
         listeners = [self._on_event, self.side_processes.emit]
@@ -240,7 +238,8 @@ class Daemon:
         What occurs after this call is not acknowledged. Returns the request's number: the loop has
         received it once ``last_taken`` reaches it.
         """
-        return self._requests.make(Command.DISARM if self.latched else Command.RAMP_OUT, by)
+        faulty = self.latched or self.state == State.FAULT  # its event may have been lost
+        return self._requests.make(Command.DISARM if faulty else Command.RAMP_OUT, by)
 
     # -- the run ----------------------------------------------------------------------------------
 
@@ -276,15 +275,9 @@ class Daemon:
         stack.callback(self._commands.close)
         stack.callback(self.memory.close)
         lock = stack.enter_context(OwnerLock(address_of(settings.link), settings.cell))
-        folder = settings.recording.folder
-        if folder is not None:
-            require_folder(folder, "recording.folder")
-        self.session = new_session(folder, self._clock.time())
-        if folder is not None:
-            log = folder / f"{self.session}{LOOP_LOG}"
-            self._output = stack.enter_context(open(log, "ab", opener=private))  # noqa: SIM115
+        self.session = stack.enter_context(self._files).session
         stack.callback(self.side_processes.close, self.event_log.add)
-        self.side_processes.start(self.configuration, self.session, self.memory, self._output)
+        self.side_processes.start(self.configuration, self.session, self.memory, self._files.log)
         stack.callback(lambda: self.event_log.add({"kind": EventKind.ENDED}))
         self._zeros.open()
         stack.callback(self._zeros.close)
@@ -362,6 +355,7 @@ class Daemon:
                     if duration is not None and not self._has_state:
                         self._ends_at = first_cycle + duration
                     self._has_state = True
+                    self._files.keep()
                     self.manager.ready()
                 if self.memory.ended and duration is None:
                     self._stopping.set()
@@ -413,7 +407,7 @@ class Daemon:
             self._requests.arm_unless_disarmed(armed_by, since)
         self._loops += 1
         return self.loop_process(
-            self.configuration, self.memory, self._commands, order, self._output, self._clock
+            self.configuration, self.memory, self._commands, order, self._files.log, self._clock
         )
 
     def _read_loop(self) -> None:
@@ -475,6 +469,8 @@ class Daemon:
         if code == Exit.INPUT and not self._has_state:
             raise InputError(detail)  # later, a file may be in the middle of an edit: retry
         if not self._has_state:
+            if code != Exit.LINK:  # it failed, or was killed: how is in its log
+                self._files.keep()
             raise LinkError(detail)
         self._fault("loop", detail)
 

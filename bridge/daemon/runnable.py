@@ -14,10 +14,7 @@ from gapbridge.drivers.replay.settings import ReplaySettings
 
 
 def require_runnable(cell: Cell, settings: DaemonSettings, clock: Clock) -> None:
-    """Raise CellError for a profile, a recording or a trajectory that the loop would refuse.
-
-    A run begins with its recording: what is refused later leaves an empty one.
-    """
+    """Raise CellError for a profile, a recording or a trajectory that the loop would refuse."""
     link, replays = settings.link, isinstance(settings.link, ReplaySettings)
     try:
         if replays or isinstance(link, ProfileSettings):

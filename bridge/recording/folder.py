@@ -5,24 +5,74 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import re
+import subprocess
 from datetime import datetime
 from pathlib import Path
+from typing import IO, Self
 
-from gapbridge.bridge.document.output_file import private
+from gapbridge.bridge.document.output_file import private, require_folder
+from gapbridge.core.errors import InputError, LinkError
 from gapbridge.core.log.mcap_reading import SUFFIX, last_batch
+from gapbridge.drivers.clock import Clock
 
 NAME = re.compile(r"(?P<session>.+)-(?P<number>\d{3,})\.mcap$")
 LOOP_LOG = ".loop.log"
 MB = 1e6
+STEM = re.compile(r"run-\d{8}-\d{6}")
+CLOCK_SET = 1_767_225_600.0  # s since 1970: before 2026 a computer's clock has not been set
+
+
+class RunFiles:
+    """The name of a run, and its files in the folder of recordings (None: it records nothing).
+
+    ``log``: the file of its processes' output. A run that is refused at its start (InputError,
+    LinkError) leaves no files, unless ``keep`` was called: a service is started every 2 s while its
+    robot is off.
+    """
+
+    def __init__(self, folder: Path | None, clock: Clock) -> None:
+        self._folder, self._clock = folder, clock
+        self._kept = False
+        self.session = ""
+        self.log: IO[bytes] | int = subprocess.DEVNULL
+
+    def keep(self) -> None:
+        """Keep the files, however the run ends."""
+        self._kept = True
+
+    def __enter__(self) -> Self:
+        """Take a name. Raises InputError where the folder cannot be used, OSError."""
+        if self._folder is not None:
+            require_folder(self._folder, "recording.folder")
+        self.session = new_session(self._folder, self._clock.time())
+        if self._folder is not None:
+            self.log = open(
+                self._folder / f"{self.session}{LOOP_LOG}", "ab", opener=private
+            )
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._folder is None or isinstance(self.log, int):
+            return
+        self.log.close()
+        if kind is not None and issubclass(kind, InputError | LinkError) and not self._kept:
+            for path in (*segments(self._folder, self.session), Path(self.log.name)):
+                with contextlib.suppress(OSError):
+                    path.unlink()
 
 
 def new_session(folder: Path | None, begin: float) -> str:
     """Return an unused name for a run that begins at ``begin`` (s since 1970), and take it.
 
-    run-YYYYmmdd-HHMMSS in local time, with a number after it where that is taken. The name is taken
-    by its loop log, so that no other daemon gets it. Raises OSError where that cannot be created.
+    run-YYYYmmdd-HHMMSS in local time, with a number after it where that is taken: also where the
+    clock has not been set, whose run is named after the newest one; else ``prune`` would take it
+    for the oldest. The name is taken by its loop log, so that no other daemon gets it. Raises
+    OSError where that cannot be created.
     """
     stem, number = f"{datetime.fromtimestamp(begin):run-%Y%m%d-%H%M%S}", 1
+    if folder is not None and begin < CLOCK_SET:
+        names = (STEM.match(session) for session, _, _ in recordings(folder))
+        stem = max([stem, *(name[0] for name in names if name)])
     name = stem
     while folder is not None and not _take(folder, name):
         number += 1
@@ -47,9 +97,15 @@ def recordings(folder: Path) -> list[tuple[str, int, Path]]:
     Names alone do not order them: -1000.mcap sorts before -999.mcap. Raises OSError.
     """
     matches = [(path, NAME.match(path.name)) for path in folder.iterdir()]
-    return sorted(
-        (match["session"], int(match["number"]), path) for path, match in matches if match
-    )
+    found = ((match["session"], int(match["number"]), path) for path, match in matches if match)
+    return sorted(found, key=lambda file: (_order(file[0]), *file))
+
+
+def _order(session: str) -> tuple[str, int]:
+    """Return what orders runs: -10 comes after -2."""
+    stem = STEM.match(session)
+    number = session[stem.end() + 1 :] if stem else ""
+    return (stem[0], int(number)) if stem and number.isdecimal() else (session, 0)
 
 
 def segments(folder: Path, session: str) -> list[Path]:

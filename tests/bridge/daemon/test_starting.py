@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
+from daemon_cell import Robot, Run
+
 from gapbridge.bridge.daemon.status import DaemonStatus
+from gapbridge.bridge.ipc.command_memory import Command
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.bridge.loop.main import _report_compiling
 from gapbridge.bridge.loop.supervisor import Cause
+from gapbridge.core.errors import LinkError
 from gapbridge.drivers.clock import SYSTEM
 
 
@@ -49,3 +56,22 @@ def test_a_slip_stays_latched_through_a_fault_that_ends_with_the_link() -> None:
     assert status.latched == "joint 3 slipped"
     status.on_event({"kind": "request", "command": "disarm", "acknowledges": True, "by": "x"})
     assert status.latched == ""
+
+
+def test_a_run_whose_robot_is_off_leaves_no_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with Run(Robot(tmp_path).cell()) as run:
+        run._thread.join()
+    assert isinstance(run.error, LinkError)
+    assert list((tmp_path / "recordings").iterdir()) == []
+
+
+def test_a_fault_whose_event_was_lost_is_acknowledged_all_the_same(tmp_path: Path) -> None:
+    """The event socket may be full; a loop in a fault could not be brought out of it."""
+    daemon = Run(Robot(tmp_path).cell()).daemon
+    daemon._last_state = State.FAULT  # as the loop's memory says
+    number = daemon.disarm("x")
+    daemon._requests.forward()
+    assert daemon._commands.last_of(Command.DISARM) == number

@@ -11,7 +11,15 @@ from test_recorder import numbers
 
 from gapbridge.bridge.recording import folder as folder_module
 from gapbridge.bridge.recording.finishing import unfinished
-from gapbridge.bridge.recording.folder import new_session, next_path, prune, segments
+from gapbridge.bridge.recording.folder import (
+    RunFiles,
+    new_session,
+    next_path,
+    prune,
+    segments,
+)
+from gapbridge.core.errors import InputError, LinkError, RunError
+from gapbridge.drivers.clock import SYSTEM
 
 OTHER = "run-20260102-080000"
 MB = 1_000_000
@@ -84,3 +92,49 @@ def test_daemons_that_begin_in_the_same_second_take_two_names(
     assert new_session(tmp_path, begin) == f"{stem}-2"
     assert other.read_bytes() == b"output of the other daemon"
     assert (tmp_path / f"{stem}-2.loop.log").exists()
+
+
+def refused(folder: Path, error: Exception, keep: bool = False) -> None:
+    """Begin a run that records a file and is refused."""
+    with RunFiles(folder, SYSTEM) as run:
+        files(folder, run.session, 1)
+        if keep:
+            run.keep()
+        raise error
+
+
+@pytest.mark.parametrize("error", [InputError("x"), LinkError("x")])
+def test_a_run_that_is_refused_at_its_start_leaves_no_files(
+    tmp_path: Path, error: Exception
+) -> None:
+    """A service is started every 2 s while its robot is off: 40,000 a day."""
+    other = files(tmp_path, OTHER, 1)
+    with pytest.raises(type(error)):
+        refused(tmp_path, error)
+    assert list(tmp_path.iterdir()) == other
+
+
+@pytest.mark.parametrize(("error", "keep"), [(RunError("x"), False), (LinkError("x"), True)])
+def test_a_run_that_fails_later_keeps_its_files(
+    tmp_path: Path, error: Exception, keep: bool
+) -> None:
+    with pytest.raises(type(error)):
+        refused(tmp_path, error, keep)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_run_before_the_clock_is_set_is_no_older_than_those_before_it(tmp_path: Path) -> None:
+    """At power up, without a battery, it is 1970: the run of today was the first to make room."""
+    old = [*files(tmp_path, OTHER, 1), *files(tmp_path, SESSION, 1, 2)]
+    oldest, newest = sorted({OTHER, SESSION})
+    for number in range(2, 12):
+        assert new_session(tmp_path, 12.0) == f"{newest}-{number}"
+    unset = [*files(tmp_path, f"{newest}-2", 1), *files(tmp_path, f"{newest}-11", 1)]
+    in_order = sorted(old, key=lambda path: not path.name.startswith(oldest))
+    assert prune(tmp_path, "run-20270101-000000", 0.0) == [*in_order, *unset]
+
+
+def test_the_first_run_of_all_may_be_before_the_clock_is_set(tmp_path: Path) -> None:
+    name = new_session(tmp_path, 12.0)
+    assert name.startswith(("run-1970", "run-1969"))
+    assert new_session(tmp_path, 12.0) == f"{name}-2"
