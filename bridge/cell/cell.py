@@ -55,6 +55,11 @@ class Cell:
         """Return the nominal arm."""
         return self.model.arm
 
+    @property
+    def folder(self) -> Path:
+        """Return the absolute folder of the file, which relative paths of side processes mean."""
+        return self.path.parent.resolve()
+
     def error(self, keys: Keys, message: str) -> CellError:
         """Return an error about a key of the file."""
         return CellError(message_at(self.document, keys, message))
@@ -89,19 +94,19 @@ class Cell:
     @property
     def recording(self) -> RecordingSettings:
         """Return section ``recording``, its folder made absolute."""
-        return self.file.recording.located(self.path.parent.resolve())
+        return self.file.recording.located(self.folder)
 
     @property
     def web(self) -> WebSettings | None:
         """Return section ``web``, its paths made absolute; None if the cell has none."""
         section = self.file.web
-        return None if section is None else section.located(self.path.parent.resolve())
+        return None if section is None else section.located(self.folder)
 
     @property
     def metrics(self) -> MetricsSettings | None:
         """Return section ``metrics``, its paths made absolute; None if the cell has none."""
         section = self.file.metrics
-        return None if section is None else section.located(self.path.parent.resolve())
+        return None if section is None else section.located(self.folder)
 
     @property
     def calibration(self) -> CalibrationSettings:

@@ -69,7 +69,7 @@ def serve_cell(
     if link is not None and link.driver in SIMULATORS:
         served = served_controller(cell, link, host, seed)
         names = ", ".join(server.name for server in served.servers)
-        emit(f"{cell.arm.name} at {served.host}: {names}, bench {served.bench_port}")
+        emit(f"{cell.arm.name} at {served.host}: {names}, control port {served.bench_port}")
         with served_sensor(cell.ft_sensor, lambda: served.controller.raw_wrench, clock, link):
             serve_controller(
                 served.controller, served.servers, served.host, served.bench_port, clock, stop
@@ -79,7 +79,7 @@ def serve_cell(
     emit(
         f"{settings.arm.name} at {settings.host}: RTDE {settings.rtde_port}, dashboard "
         f"{settings.dashboard_port}, primary {settings.primary_port}, scripts "
-        f"{settings.script_port}, bench {settings.bench_port}"
+        f"{settings.script_port}, control port {settings.bench_port}"
     )
     serve(
         settings, clock, stop,

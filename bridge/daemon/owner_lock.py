@@ -51,7 +51,11 @@ class OwnerLock:
         except OSError:
             owner = _read(fd)
             os.close(fd)
-            who = f"process {owner['pid']}, {owner['cell']}" if "pid" in owner else "another user"
+            who = (
+                f"process {owner['pid']}, {owner['cell']}"
+                if "pid" in owner
+                else ("of another user, or with another runtime folder")
+            )
             raise InputError(
                 f"{self._cell}: link: {self.address} is in use by another daemon ({who}), "
                 "expected one owner per controller"
