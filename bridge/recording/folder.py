@@ -46,9 +46,7 @@ class RunFiles:
             require_folder(self._folder, "recording.folder")
         self.session = new_session(self._folder, self._clock.time())
         if self._folder is not None:
-            self.log = open(
-                self._folder / f"{self.session}{LOOP_LOG}", "ab", opener=private
-            )
+            self.log = open(self._folder / f"{self.session}{LOOP_LOG}", "ab", opener=private)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
