@@ -119,7 +119,7 @@ class RunSummary:
             lines.append(f"the loop's process was restarted {self.restarts} times")
         if self.lost_rows:
             lines.append(f"{self.lost_rows} cycles could not be recorded")
-        if self.recording is not None:
+        if self.recording is not None and not 0 < self.cycles <= self.lost_rows:
             lines.append(f"recorded in {self.recording}")
         return lines
 

@@ -12,7 +12,7 @@ from typing import IO, Self
 
 from gapbridge.bridge.document.output_file import private, require_folder
 from gapbridge.core.errors import InputError, LinkError
-from gapbridge.core.log.mcap_reading import SUFFIX, last_batch
+from gapbridge.core.log.mcap_reading import SUFFIX, files_of, last_batch
 from gapbridge.drivers.clock import Clock
 
 NAME = re.compile(r"(?P<session>.+)-(?P<number>\d{3,})\.mcap$")
@@ -41,12 +41,21 @@ class RunFiles:
         self._kept = True
 
     def __enter__(self) -> Self:
-        """Take a name. Raises InputError where the folder cannot be used, OSError."""
-        if self._folder is not None:
-            require_folder(self._folder, "recording.folder")
-        self.session = new_session(self._folder, self._clock.time())
-        if self._folder is not None:
-            self.log = open(self._folder / f"{self.session}{LOOP_LOG}", "ab", opener=private)
+        """Take a name. Raises InputError where the folder cannot be used.
+
+        A full disk is no reason not to run: there is no log, and the recorder waits for room.
+        """
+        now = self._clock.time()
+        if self._folder is None:
+            self.session = new_session(None, now)
+            return self
+        require_folder(self._folder, "recording.folder")
+        try:
+            self.session = new_session(self._folder, now)
+            log = self._folder / f"{self.session}{LOOP_LOG}"
+            self.log = open(log, "ab", opener=private)
+        except OSError:
+            self.session = new_session(None, now)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -130,8 +139,8 @@ def prune(folder: Path, session: str, keep_total: float | None) -> list[Path]:
     """Remove the oldest files until recordings take no more than ``keep_total`` MB; return them.
 
     Files of other runs are removed first, then this run's oldest. Only files named by a recorder
-    are removed, and none that one is writing: several daemons may share a folder. Raises nothing:
-    files that cannot be removed are kept.
+    are removed, and none that one is writing (several daemons may share a folder) or that is
+    replayed. Raises nothing: files that cannot be removed are kept.
     """
     if keep_total is None:
         return []
@@ -161,8 +170,20 @@ def _sizes(folder: Path) -> dict[tuple[str, Path], int]:
     return sizes
 
 
+def hold(recording: Path) -> list[IO[bytes]]:
+    """Return the files of a recording, opened: until they are closed, ``prune`` removes none.
+
+    Raises OSError, LogError where there is none.
+    """
+    held: list[IO[bytes]] = [path.open("rb") for path in files_of(recording)]
+    for file in held:
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    return held
+
+
 def _remove(path: Path) -> bool:
-    """Remove a file unless its recorder holds its lock; returns whether it was removed."""
+    """Remove a file unless somebody holds its lock; returns whether it was removed."""
     with path.open("r+b") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -6,18 +6,22 @@ If the daemon is killed, it goes on recording until the loop has ramped out.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import re
 import signal
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import yaml
 
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.side_main import StartData, read_start_data
+from gapbridge.bridge.recording.folder import hold
 from gapbridge.bridge.recording.recorder import Recorder
+from gapbridge.core.errors import LogError
+from gapbridge.drivers.replay.settings import ReplaySettings
 
 LOOK_EVERY = 0.1  # s
 HEARTBEAT_TIMEOUT = 0.6  # s without a heartbeat of the loop: the run of a lost daemon is over
@@ -32,6 +36,10 @@ def main() -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
     start = read_start_data()
+    replayed: list[IO[bytes]] = []
+    if isinstance(start.settings.link, ReplaySettings):
+        with contextlib.suppress(OSError, LogError):  # the loop says so
+            replayed = hold(start.settings.link.file)  # before the recorder makes room
     recorder = Recorder(
         start.settings.recording,
         start.session,
@@ -44,6 +52,8 @@ def main() -> None:
     if not ended:
         _record_remaining(start, recorder)
     recorder.close()
+    for file in replayed:
+        file.close()
 
 
 def _follow(start: StartData, recorder: Recorder) -> bool:

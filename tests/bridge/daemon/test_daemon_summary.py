@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -116,3 +118,11 @@ def test_the_faults_of_a_link_that_is_lost_for_days_fit_into_one_event(count: in
     else:
         assert found == kept
     assert len(json.dumps(faults.texts)) < 1 << 16  # of the smallest pipe
+
+
+@pytest.mark.parametrize(("lost", "said"), [(0, True), (2, True), (3, False)])
+def test_a_run_of_which_nothing_could_be_recorded_names_no_recording(lost: int, said: bool) -> None:
+    tally = Tally(N, RATE_HZ)
+    tally.add(rows([0.0, 0.002, 0.004]))
+    lines = replace(summary(tally), lost_rows=lost, recording=Path("run-1")).lines()
+    assert ("recorded in run-1" in lines) == said

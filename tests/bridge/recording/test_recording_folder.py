@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import subprocess
 from datetime import datetime
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from gapbridge.bridge.recording import folder as folder_module
 from gapbridge.bridge.recording.finishing import unfinished
 from gapbridge.bridge.recording.folder import (
     RunFiles,
+    hold,
     new_session,
     next_path,
     prune,
@@ -138,3 +141,27 @@ def test_the_first_run_of_all_may_be_before_the_clock_is_set(tmp_path: Path) -> 
     name = new_session(tmp_path, 12.0)
     assert name.startswith(("run-1970", "run-1969"))
     assert new_session(tmp_path, 12.0) == f"{name}-2"
+
+
+def test_a_disk_without_room_for_a_name_keeps_no_run_from_starting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No inode, or a quota: it was a crash, and of a service one every 2 s."""
+
+    def full(folder: Path, session: str) -> bool:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(folder_module, "_take", full)
+    with RunFiles(tmp_path, SYSTEM) as run:
+        assert run.session.startswith("run-")
+        assert run.log == subprocess.DEVNULL
+
+
+def test_a_recording_that_is_replayed_does_not_make_room(tmp_path: Path) -> None:
+    """With the recorded cell a replay records into the same folder, of which it was the oldest."""
+    own = files(tmp_path, OTHER, 1, 2)
+    held = hold(tmp_path / OTHER)
+    assert prune(tmp_path, SESSION, 0.0) == []
+    for file in held:
+        file.close()
+    assert prune(tmp_path, SESSION, 0.0) == own
