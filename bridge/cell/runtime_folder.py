@@ -79,7 +79,10 @@ def state_folder() -> Path:
 
 
 def cell_key(cell: Path) -> str:
-    """Return a short name for a cell file: its stem and a hash of its absolute path."""
-    absolute = os.fsencode(cell.resolve())
-    stem = os.fsencode(cell.stem)[:40].decode(errors="ignore")  # bytes: a socket's path holds 107
-    return f"{stem}-{hashlib.sha256(absolute).hexdigest()[:10]}"
+    """Return a short name for a cell file: stem and hash of its path, all links followed.
+
+    Raises nothing: a daemon must be found whatever has become of its file.
+    """
+    path = os.path.realpath(cell)
+    stem = os.fsencode(Path(path).stem)[:40].decode(errors="ignore")  # bytes: 107 in all
+    return f"{stem}-{hashlib.sha256(os.fsencode(path)).hexdigest()[:10]}"

@@ -22,9 +22,8 @@ def ask(cell: Path, command: str) -> Any:
     """Return a daemon's answer to a command.
 
     Raises InputError if no daemon runs for the cell, RunError if it refuses or does not answer.
+    The file need not be there any more: who moves it must still be able to disarm.
     """
-    if not cell.exists():
-        raise InputError(f"{cell}: file not found, expected a cell file (YAML)")
     name = f"{cell_key(cell)}.sock"
     refused = silent = ""
     for folder in candidates():
@@ -41,8 +40,12 @@ def ask(cell: Path, command: str) -> Any:
     if not refused:
         from gapbridge.bridge.cell.document import read_document  # brings yaml
 
-        read_document(cell)  # raises for what is no cell
-    raise InputError(refused or f"{cell}: found no running daemon, expected one: gapbridge run")
+        others = ", ".join(str(status["cell"]) for status in running())
+        if not others:
+            read_document(cell)  # raises for what is no cell
+        refused = f"{cell}: found no running daemon, expected one: gapbridge run"
+        refused += f" (running: {others})" if others else ""
+    raise InputError(refused)
 
 
 def ask_socket(path: Path, command: str) -> Any:

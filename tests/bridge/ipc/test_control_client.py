@@ -44,6 +44,29 @@ def asked(cell: Path) -> Iterator[list[str]]:
         yield heard
 
 
+def test_a_daemon_is_found_by_a_link_to_its_cell_and_without_the_file(
+    cell: Path, asked: list[str]
+) -> None:
+    """It was started by the link, or its file was moved: nobody could disarm the arm."""
+    link = cell.with_name("current.yaml")
+    link.symlink_to(cell.name)
+    assert ask(link, "disarm") == "observing"
+    cell.rename(cell.with_name("moved.yaml"))
+    assert ask(cell, "disarm") == "observing"
+    assert ask(link, "disarm") == "observing"
+
+
+def test_who_asks_for_no_daemon_is_told_which_ones_run(
+    cell: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A link was set to another cell while the daemon of the one before runs."""
+    with pytest.raises(InputError, match=r"expected one: gapbridge run$"):
+        ask(cell, "disarm")
+    monkeypatch.setattr(control_client, "running", lambda: [{"cell": "/cells/before.yaml"}])
+    with pytest.raises(InputError, match=r"no running daemon.* \(running: /cells/before.yaml\)"):
+        ask(cell, "disarm")
+
+
 def test_a_socket_in_a_folder_of_somebody_else_is_not_believed(
     cell: Path, asked: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
