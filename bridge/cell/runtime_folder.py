@@ -11,6 +11,7 @@ from pathlib import Path
 
 from gapbridge.core.errors import InputError
 
+LOGINS = Path("/run/user")  # where systemd has the XDG_RUNTIME_DIR of each user who is logged in
 PLANNER = ".planner.sock"  # ends the name of a planner's socket; a daemon's ends with .sock
 
 
@@ -23,6 +24,17 @@ def candidates() -> list[Path]:
         folders.append(Path(folder) / "gapbridge")
     folders += [Path("/run/gapbridge"), Path(tempfile.gettempdir()) / f"gapbridge-{os.getuid()}"]
     return folders
+
+
+def lookups() -> list[Path]:
+    """Return the folders where a daemon may listen: the candidates, and those of login sessions.
+
+    ``su``, ``sudo`` and cron have no XDG_RUNTIME_DIR, and must be able to disarm all the same:
+    their user's daemon, root everybody's.
+    """
+    user = os.geteuid()
+    sessions = [LOGINS / str(user)] if user else sorted(LOGINS.glob("*"))
+    return list(dict.fromkeys([*candidates(), *(folder / "gapbridge" for folder in sessions)]))
 
 
 def runtime_folder() -> Path:

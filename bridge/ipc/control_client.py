@@ -10,7 +10,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gapbridge.bridge.cell.runtime_folder import PLANNER, candidates, cell_key, owner_of
+from gapbridge.bridge.cell.runtime_folder import (
+    PLANNER,
+    candidates,
+    cell_key,
+    lookups,
+    owner_of,
+)
 from gapbridge.bridge.ipc.control_socket import peer_of
 from gapbridge.core.errors import InputError, RunError, first_line
 
@@ -26,7 +32,7 @@ def ask(cell: Path, command: str) -> Any:
     """
     name = f"{cell_key(cell)}.sock"
     refused = silent = ""
-    for folder in candidates():
+    for folder in lookups():
         try:
             return ask_socket(folder / name, command)
         except PermissionError:

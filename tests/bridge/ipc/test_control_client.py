@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from patience import PATIENCE
 
+from gapbridge.bridge.cell import runtime_folder as runtime_module
 from gapbridge.bridge.cell.runtime_folder import candidates, cell_key, runtime_folder
 from gapbridge.bridge.ipc import control_client
 from gapbridge.bridge.ipc.control_client import ask, ask_socket, running
@@ -54,6 +55,25 @@ def test_a_daemon_is_found_by_a_link_to_its_cell_and_without_the_file(
     cell.rename(cell.with_name("moved.yaml"))
     assert ask(cell, "disarm") == "observing"
     assert ask(link, "disarm") == "observing"
+
+
+@pytest.mark.parametrize("user", ["own", "another"])
+def test_a_daemon_of_a_login_is_found_without_its_environment(
+    cell: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, user: str
+) -> None:
+    """By su, sudo and cron: they said that no daemon runs. Root finds everybody's."""
+    if user == "another" and os.geteuid() != 0:
+        pytest.skip("only root may ask daemons of others")
+    logins = tmp_path / "user"
+    number = os.geteuid() if user == "own" else STRANGER
+    (folder := logins / str(number)).mkdir(0o700, parents=True)
+    monkeypatch.setattr(runtime_module, "LOGINS", logins)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    path = runtime_folder() / f"{cell_key(cell)}.sock"
+    with ControlSocket(path, lambda command, _: {"ok": True, "answer": command}, SYSTEM):
+        os.chown(path.parent, number, -1)
+        monkeypatch.delenv("XDG_RUNTIME_DIR")
+        assert ask(cell, "disarm") == "disarm"
 
 
 def test_who_asks_for_no_daemon_is_told_which_ones_run(
