@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from gapbridge.core.arm import Arm, JointLimits, arm_from_dh, builtin_arm
 from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.model import Model
-from gapbridge.core.planning.capsules import Box
-from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 from gapbridge.core.rotation import rotation_matrix
+from gapbridge.core.workspace.capsules import Box
+from gapbridge.core.workspace.workspace import Place, Reflector, Workspace
 
 Array = NDArray[np.float64]
 BUILTIN = ("ur3e", "ur5e", "ur10e", "ur16e", "ur20", "ur30")

@@ -24,10 +24,10 @@ from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.errors import InputError, PlanError
 from gapbridge.core.metrology import Metrology
-from gapbridge.core.planning.capsules import Box
 from gapbridge.core.planning.design import SessionDesign, load_extent, plan
 from gapbridge.core.planning.payload_plan import LIMIT_MARGIN
-from gapbridge.core.planning.workspace import Place, Reflector, Workspace
+from gapbridge.core.workspace.capsules import Box
+from gapbridge.core.workspace.workspace import Place, Reflector, Workspace
 
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, if the cell does not give it
 FIXTURES = {"distance": "fixed end", "sphere": "sphere", "point": "point"}

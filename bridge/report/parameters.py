@@ -81,7 +81,8 @@ def _next(measurements: tuple[Measurement, ...]) -> list[blocks.Block]:
     text = (
         "Move to these poses with these loads and add the rows to the log"
         f"{'; record a motion through those with a speed' if moving else ''}. Check each for free "
-        "space first: the poses respect the joint limits, but obstacles are not known here."
+        "space first: they keep to the joint limits and clear of the arm itself, by a coarse shape "
+        "of it and its tool; what stands around it is not known here."
     )
     content: list[blocks.Block] = [blocks.Paragraph(text), measurements_table(measurements, SHOWN)]
     more = len(measurements) - SHOWN

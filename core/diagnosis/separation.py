@@ -18,7 +18,7 @@ from functools import partial
 
 import numpy as np
 
-from gapbridge.core.arrays import Array
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.criteria import MIN_SEPARATION
 from gapbridge.core.diagnosis.finding import Check
@@ -39,16 +39,20 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
+from gapbridge.core.workspace.workspace import clear_of_itself
 
 PER_QUESTION = 2  # measurements proposed per open question
 MIN_POSE_DISTANCE = 0.5  # rad, of some joint, between proposed poses
 MIN_POSE_DEPENDENCE = 1e-6  # share of a difference that has to depend on the pose
 Predict = Callable[[Sequence[Term]], Array]
 POSES = 160
+DRAWN = 4 * POSES  # of which those are left out at which the arm meets itself
 MAX_SPEED_SHARE = 0.7  # of a joint's speed limit, in a trial
 ACCELERATION_TIME = 0.25  # s from rest to the speed limit, at least
 DEFAULT_MAX_SPEED = 2.0  # rad/s for joints without a speed limit
 LEAD, STEP = 0.5, 0.004  # s: duration and sampling of a trial's motion before its pose
+BEFORE = np.arange(-round(LEAD / STEP), 1)[:, None, None] * STEP  # s, of its samples
+WAY = 5  # places on it that are checked for the arm itself
 STILL = 0.02  # share of the speed limit below which the direction of motion is uncertain
 
 
@@ -77,9 +81,10 @@ class _OpenQuestion:
 def next_measurements(
     model: Model, log: Log, channels: Sequence[ChannelDiagnosis], seed: int = 0
 ) -> tuple[Measurement, ...]:
-    """Return poses and loads, within the joint limits, that resolve ties or excite other effects.
+    """Return poses and loads that resolve ties or excite other effects.
 
-    Motions through the poses if the log is a recording; else poses at rest, without tracking.
+    They are within the joint limits, and clear of the arm itself by its coarse shape. Motions
+    through the poses if the log is a recording; else poses at rest, without tracking.
     """
     chosen: list[Measurement] = []
     drawn = draw_trials(model, log, seed)
@@ -220,22 +225,10 @@ class Trials:
 
 
 def draw_trials(model: Model, log: Log, seed: int) -> Trials:
-    """Return random trials within the joint limits and the rated load."""
+    """Return random trials within the joint limits and the rated load, clear of the arm itself."""
     rng = np.random.default_rng(seed)
     low, high = _range(model)
-    q = rng.uniform(low, high, (POSES, model.arm.n))
-    rated = model.arm.payload if np.isfinite(model.arm.payload) else 0.0
-    mass, cog, warm = (log.get(name) for name in ("payload", "payload_cog", "joint_temperatures"))
-    most = max(rated, model.payload_mass, 0.0 if mass is None else float(np.nanmax(mass)))
-    masses = np.array([0.0, 0.5, 1.0])[rng.integers(0, 3, POSES)] * most
-    time = log.get("timestamp")
-    loads = Loads(
-        payload_mass=masses,
-        payload_cog=np.tile(model.payload_cog if cog is None else cog[-1], (POSES, 1)),
-        temperature=None if warm is None else np.tile(warm[-1], (POSES, 1)),
-        approach=rng.choice([-1.0, 1.0], (POSES, model.arm.n)),
-    )
-    end, start = (0.0, 0.0) if time is None else (float(time[-1]), float(time[0]))
+    q = rng.uniform(low, high, (DRAWN, model.arm.n))
     fastest = max_speed(model)
     qd = MAX_SPEED_SHARE * fastest * rng.uniform(-1.0, 1.0, q.shape)
     # limited so that the trial does not begin above the speed limit
@@ -243,7 +236,49 @@ def draw_trials(model: Model, log: Log, seed: int) -> Trials:
         rng.uniform(-1.0, 1.0, q.shape) * fastest / ACCELERATION_TIME,
         (qd - fastest) / LEAD, (qd + fastest) / LEAD,
     )  # fmt: skip
+    slower = _within_limits(model, q, qd, qdd)
+    qd, qdd = slower * qd, slower * qdd
+    kept = _clear(model, q, qd, qdd)
+    q, qd, qdd = q[kept], qd[kept], qdd[kept]
+    rated = model.arm.payload if np.isfinite(model.arm.payload) else 0.0
+    mass, cog, warm = (log.get(name) for name in ("payload", "payload_cog", "joint_temperatures"))
+    most = max(rated, model.payload_mass, 0.0 if mass is None else float(np.nanmax(mass)))
+    masses = np.array([0.0, 0.5, 1.0])[rng.integers(0, 3, len(q))] * most
+    time = log.get("timestamp")
+    loads = Loads(
+        payload_mass=masses,
+        payload_cog=np.tile(model.payload_cog if cog is None else cog[-1], (len(q), 1)),
+        temperature=None if warm is None else np.tile(warm[-1], (len(q), 1)),
+        approach=rng.choice([-1.0, 1.0], q.shape),
+    )
+    end, start = (0.0, 0.0) if time is None else (float(time[-1]), float(time[0]))
     return Trials(q, loads, qd, qdd, end, start)
+
+
+def _within_limits(model: Model, q: Array, qd: Array, qdd: Array) -> Array:
+    """Return the factors (N, n), 0 to 1, on a motion that keep it within the joint limits.
+
+    On its way to the pose, and where it brakes behind it.
+    """
+    limits = model.arm.limits
+    way = qd * BEFORE + 0.5 * qdd * BEFORE**2  # (k, N, n)
+    brake = 0.5 * qd * np.abs(qd) * ACCELERATION_TIME / max_speed(model)
+    factor = np.ones_like(q)
+    for side, limit in ((1.0, limits.upper), (-1.0, limits.lower)):
+        room = np.maximum(side * (limit - q), 0.0)
+        reached = np.maximum((side * way).max(axis=0), 1e-9)
+        behind = np.maximum(side * brake, 1e-9)
+        factor = np.minimum(factor, np.minimum(room / reached, np.sqrt(room / behind)))
+    return factor
+
+
+def _clear(model: Model, q: Array, qd: Array, qdd: Array) -> Index:
+    """Return the first POSES motions on whose way the arm does not meet itself; else any."""
+    before = np.linspace(-LEAD, 0.0, WAY)[:, None, None]
+    way = q + qd * before + 0.5 * qdd * before**2
+    clear = clear_of_itself(model, way.reshape(-1, q.shape[1])).reshape(way.shape[:2]).all(axis=0)
+    # an arm that is always near itself by its coarse shape is tried everywhere
+    return np.flatnonzero(clear if clear.any() else ~clear)[:POSES]
 
 
 def max_speed(model: Model) -> Array:
@@ -285,7 +320,7 @@ def _motion(model: Model, trials: Trials) -> Motion:
 def _encoder_angles(model: Model, trials: Trials) -> Predict:
     """Return the predictor of the encoder angles at the end of each trial's motion."""
     count, n = trials.q.shape
-    before = np.arange(-round(LEAD / STEP), 1) * STEP
+    before = BEFORE.ravel()
     k = len(before)
     t = before[None, :, None]
     q = (trials.q[:, None] + trials.qd[:, None] * t + 0.5 * trials.qdd[:, None] * t**2).reshape(

@@ -25,7 +25,7 @@ from gapbridge.core.errors import PlanError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
-from gapbridge.core.planning.workspace import Place, Rejection, RejectionReason, Workspace
+from gapbridge.core.workspace.workspace import Place, Rejection, RejectionReason, Workspace
 
 STOPS = 900  # candidate poses
 SAMPLES = 4000  # random poses drawn per round

@@ -42,7 +42,7 @@ from gapbridge.core.planning.refinement import (
     reference_weights,
 )
 from gapbridge.core.planning.travel import joint_speed, move_times, shortest_order
-from gapbridge.core.planning.workspace import Workspace
+from gapbridge.core.workspace.workspace import Workspace
 
 REFERENCE_POSES = 200  # poses over which the accuracy of the predicted TCP is evaluated
 COMPARISON_ROUNDS = 3

@@ -11,7 +11,7 @@ from gapbridge.core.calibration.payload_session import NAMES, weight_columns
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
 from gapbridge.core.planning.travel import ordered_poses
-from gapbridge.core.planning.workspace import Workspace
+from gapbridge.core.workspace.workspace import Workspace
 
 WRIST_JOINTS = 3  # last joints, which turn the flange with little motion of the arm
 CANDIDATES = 600

@@ -24,7 +24,7 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.planning.candidates import Candidates, measurable
 from gapbridge.core.planning.exchange import Choice
 from gapbridge.core.planning.information import Reference, information_of, inverse, whitened_rows
-from gapbridge.core.planning.workspace import Workspace
+from gapbridge.core.workspace.workspace import Workspace
 
 STEP = 0.02  # rad, for the gradient
 LENGTHS = (0.03, 0.06, 0.12, 0.25, 0.5)  # rad, down the gradient

@@ -13,7 +13,7 @@ from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.planning.workspace import Place, Workspace
+from gapbridge.core.workspace.workspace import Place, Workspace
 
 SIGMA = 3e-5
 LOADS = (Payload(4.0, (0.0, 0.02, 0.06), "plate"), Payload(0.0))

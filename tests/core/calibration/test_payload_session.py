@@ -17,9 +17,9 @@ from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
-from gapbridge.core.planning.capsules import Box
 from gapbridge.core.planning.payload_plan import plan_payload
-from gapbridge.core.planning.workspace import Workspace
+from gapbridge.core.workspace.capsules import Box
+from gapbridge.core.workspace.workspace import Workspace
 
 Array = NDArray[np.float64]
 KIND = ARMS["cobot10"]

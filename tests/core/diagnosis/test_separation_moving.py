@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import moving_truth as truth
 import numpy as np
 import pytest
@@ -9,7 +11,9 @@ import pytest
 from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.separation import LEAD, POSES, draw_trials
 from gapbridge.core.model import Model
+from gapbridge.core.workspace.workspace import Workspace
 
 N = 6
 MODEL = Model(builtin_arm("ur5e"))
@@ -74,3 +78,29 @@ def test_speed_and_acceleration_are_in_the_document(slow):
     reported = [m for m in document(slow)["next_measurements"] if len(m["separates"]) == 2]
     assert reported
     assert all(len(m["velocity"]) == len(m["acceleration"]) == N for m in reported)
+
+
+@pytest.mark.parametrize("name", ["ur5e", "ur10e"])
+@pytest.mark.parametrize("margin", [None, 0.8])
+def test_trials_keep_within_the_limits_and_clear_of_the_arm_itself(name, margin):
+    """Without the check every second pose of a UR5e meets the arm itself.
+
+    ``margin`` (rad): half the range of a joint, as that of a short wrist; the way of half a second
+    is longer.
+    """
+    model = Model(builtin_arm(name))
+    if margin is not None:
+        limits = replace(model.arm.limits, lower=np.full(N, -margin), upper=np.full(N, margin))
+        model = replace(model, arm=replace(model.arm, limits=limits))
+    limits = model.arm.limits
+    trials = draw_trials(model, truth.log_of(N, actual_q=np.zeros((2, N))), 3)
+    assert len(trials.q) == POSES
+    space = Workspace.of(model)
+    for time in np.linspace(-LEAD, 0.0, 20):
+        way = trials.q + trials.qd * time + 0.5 * trials.qdd * time**2
+        assert np.all((limits.lower - 1e-4 <= way) & (way <= limits.upper + 1e-4))
+        if time in (-LEAD, 0.0):
+            assert space.clear(np.clip(way, space.lower, space.upper)).all()
+    assert np.median(np.abs(trials.qd)) > 0.1  # they still move
+    braked = trials.q + 0.5 * trials.qd * np.abs(trials.qd) * 0.25 / limits.velocity
+    assert np.all((limits.lower - 1e-9 <= braked) & (braked <= limits.upper + 1e-9))

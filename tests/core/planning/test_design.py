@@ -33,7 +33,7 @@ from gapbridge.core.planning.exchange import (
     forward_selected,
 )
 from gapbridge.core.planning.information import information_of, inverse, whitened_rows
-from gapbridge.core.planning.workspace import Place, Reflector, Workspace
+from gapbridge.core.workspace.workspace import Place, Reflector, Workspace
 
 
 def plan(*given, progress=lambda text, share: None, **asked) -> Plan:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import PlanError
 from gapbridge.core.model import Model
-from gapbridge.core.planning.capsules import Box, segment_distance
-from gapbridge.core.planning.workspace import (
+from gapbridge.core.workspace.capsules import Box, segment_distance
+from gapbridge.core.workspace.workspace import (
     Place,
     Reflector,
     Rejection,

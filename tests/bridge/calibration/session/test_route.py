@@ -12,8 +12,8 @@ from gapbridge.bridge.calibration.joints.link import PERIOD, write_move
 from gapbridge.bridge.calibration.session.positioning import all_free, route
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
-from gapbridge.core.planning.capsules import Box
-from gapbridge.core.planning.workspace import Workspace
+from gapbridge.core.workspace.capsules import Box
+from gapbridge.core.workspace.workspace import Workspace
 
 BEGIN, END = np.array([-1.0, 0.0]), np.array([1.0, 0.0])
 ABOVE, LEFT, RIGHT = np.array([0.0, 2.0]), np.array([-1.0, 1.5]), np.array([1.0, 1.5])

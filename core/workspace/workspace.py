@@ -14,11 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gapbridge.core.arm import JointLimits
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.dynamics import frames_of
 from gapbridge.core.errors import PlanError
 from gapbridge.core.model import Model
-from gapbridge.core.planning.capsules import Box, Capsules, below, colliding, in_box, occluded
+from gapbridge.core.workspace.capsules import Box, Capsules, below, colliding, in_box, occluded
 
 LINK_RADIUS_SHARE = 0.035  # of the arm's stretched length: radius of a link
 TOOL_RADIUS_SHARE = 0.03  # of the same: tool and loads
@@ -210,6 +211,13 @@ class Workspace:
     def draw(self, count: int, random: np.random.Generator) -> Array:
         """Return joints (count, n), rad, uniform within the limits."""
         return random.uniform(self.lower, self.upper, (count, len(self.lower)))
+
+
+def clear_of_itself(model: Model, q: Array) -> Mask:
+    """Return at which joints (N, n), rad, no link or tool comes near another (N,)."""
+    unlimited = replace(model.arm, limits=JointLimits.none(model.arm.n))
+    workspace = Workspace.of(replace(model, arm=unlimited))
+    return ~colliding(workspace.capsules(workspace.frames(q)), workspace.pairs)
 
 
 def _limits(
