@@ -1,7 +1,8 @@
 """Where the arm may be measured: joint limits, keep-out boxes, and line of sight.
 
-Links are modelled as capsules between joint origins, tool and loads as capsules beyond the flange,
-all of the nominal rigid arm. The model is coarse: check a planned pose before the arm moves there.
+Links are modelled as capsules between joint origins, against boxes also where their centres of
+gravity stand beside that line; tool and loads as capsules beyond the flange, all of the nominal
+rigid arm. The model is coarse: check a planned pose before the arm moves there.
 """
 
 from __future__ import annotations
@@ -73,6 +74,7 @@ class Frames:
 
     origin: Array  # (N, n+2, 3) m: base, joints 1..n, flange
     axis: Array  # (N, n, 3) of the joints
+    centre: Array  # (N, n, 3) m: centres of gravity of the links
     flange: Array  # (N, 3, 3)
     tcp: Array  # (N, 3) m
     rotation: Array  # (N, 3, 3) of the TCP
@@ -141,9 +143,10 @@ class Workspace:
         chain = self.model.without_terms().chain()
         rigid = frames_of(chain, q, still, still)
         flange, origin = rigid.rotation[:, n], rigid.origin[:, n]
+        centre = rigid.origin[:, :n] + np.einsum("njab,jb->nja", rigid.rotation[:, :n], chain.cog)
         return Frames(
             np.concatenate([np.zeros((len(q), 1, 3)), rigid.origin], axis=1),
-            rigid.rotation[:, :n, :, 2], flange, origin + flange @ chain.tool_position,
+            rigid.rotation[:, :n, :, 2], centre, flange, origin + flange @ chain.tool_position,
             flange @ chain.tool_rotation,
         )  # fmt: skip
 
@@ -156,6 +159,21 @@ class Workspace:
         radius = np.concatenate([self.radius, np.full(len(ends), self.tool_radius)])
         return Capsules(begin, end, radius)
 
+    def beside(self, frames: Frames) -> Capsules:
+        """Return the links 1 to n where they stand beside the line between their joints.
+
+        A UR10e's upper arm is 0.18 m beside it, along the joint's axis, and its centre of gravity
+        shows that: each link is there, and halfway.
+        """
+        begin, end = frames.origin[:, 1:-1], frames.origin[:, 2:]
+        along = end - begin
+        along = along / np.maximum(np.linalg.norm(along, axis=2, keepdims=True), MIN_LENGTH)
+        aside = frames.centre - begin
+        aside = aside - np.sum(aside * along, axis=2, keepdims=True) * along
+        moved = [np.concatenate([side + share * aside for share in (0.5, 1.0)], axis=1)
+                 for side in (begin, end)]  # fmt: skip
+        return Capsules(moved[0], moved[1], np.tile(self.radius[1:], 2))
+
     def clear(self, q: Array) -> Mask:
         """Return which joints (N, n) are free of limits, boxes, floor and self-collision (N,)."""
         return np.asarray(~np.any(list(self._hits(q, self.frames(q)).values()), axis=0))
@@ -167,7 +185,8 @@ class Workspace:
             Rejection(RejectionReason.LIMITS): np.asarray(out.any(axis=1))
         }
         for number, box in enumerate(self.keep_out, 1):
-            hits[Rejection(RejectionReason.BOX, number)] = in_box(capsules, box)
+            inside = in_box(capsules, box) | in_box(self.beside(frames), box)
+            hits[Rejection(RejectionReason.BOX, number)] = inside
         if self.floor is not None:
             hits[Rejection(RejectionReason.FLOOR)] = below(capsules, self.floor, first=2)
         hits[Rejection(RejectionReason.SELF)] = colliding(capsules, self.pairs)

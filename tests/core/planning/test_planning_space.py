@@ -63,6 +63,19 @@ def test_a_thin_wall_between_the_joints_is_seen(model: Model) -> None:
     assert not Workspace.of(model, keep_out=[wall]).clear(OUT).any()
 
 
+@pytest.mark.parametrize(("joint", "beside"), [(2, 0.1762), (3, 0.0393)])
+def test_a_box_is_hit_by_a_link_that_stands_beside_the_line_between_its_joints(joint, beside):
+    """``beside``: of the tubes of a UR10e, m, from the manufacturer's description of it."""
+    model = Model(builtin_arm("ur10e"))
+    rng = np.random.default_rng(0)
+    for q in Workspace.of(model).draw(20, rng)[:, None]:
+        frames = Workspace.of(model).frames(q)
+        middle = frames.origin[0, joint : joint + 2].mean(axis=0)
+        tube = middle + beside * frames.axis[0, joint - 1]
+        space = Workspace.of(model, keep_out=[Box(tuple(tube - 0.02), tuple(tube + 0.02))])
+        assert space.rejections(q)[Rejection(RejectionReason.BOX, 1)].all()
+
+
 def test_the_floor_stops_the_forearm_and_not_the_foot(model: Model) -> None:
     space = Workspace.of(model, floor=0.0)
     assert space.clear(UP).all()
