@@ -27,7 +27,7 @@ from gapbridge.bridge.report.labels import (
 )
 from gapbridge.bridge.report.material import Material, after, chosen_channel, shares, unexplained
 from gapbridge.bridge.report.slips import advice, answered, slips_of
-from gapbridge.core.diagnosis.causes import Cause
+from gapbridge.core.diagnosis.causes import Cause, Outcome
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
@@ -138,6 +138,13 @@ def _causes(channel: ChannelDiagnosis) -> str:
     if not channel.causes:
         if channel.verdict is Verdict.NO_GAP:
             return "Model and measurement agree: no effect is needed to explain the difference."
+        fits = [k.effect for k in channel.considered if k.outcome is Outcome.WITHDRAWN]
+        if fits:
+            titles = listed([effect_title(name) for name in fits], "or")
+            return (
+                f"No effect is named as its cause. It may be one that fits but did not pass every "
+                f"check: {titles} (“Which effect causes it” gives the reasons)."
+            )
         return (
             "No effect of the catalogue explains it, so none is named as a cause: its cause is not "
             "in the catalogue."

@@ -64,13 +64,21 @@ def quantity_title(name: str) -> str:
     title = _QUANTITIES[stem][0]
     if index is None:
         return title
+    if _is_torque(stem, index):
+        title = title.replace("force", "torque")
     return f"{title} {_AXES[index]}" if COLUMNS.get(stem) else f"{title} {index + 1}"
 
 
 def quantity_unit(name: str) -> tuple[str, float]:
     """Return the display unit of a log column, and the factor from SI."""
-    _, unit, factor = _QUANTITIES.get(_column(name)[0], ("", "", 1.0))
-    return unit, factor
+    stem, index = _column(name)
+    _, unit, factor = _QUANTITIES.get(stem, ("", "", 1.0))
+    return ("Nm" if _is_torque(stem, index) else unit), factor
+
+
+def _is_torque(stem: str, index: int | None) -> bool:
+    """Return whether a column is a torque of the outside wrench."""
+    return stem == "actual_TCP_force" and (index or 0) >= 3
 
 
 def _column(name: str) -> tuple[str, int | None]:

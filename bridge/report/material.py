@@ -44,8 +44,8 @@ class Shares:
 def shares(channel: ChannelDiagnosis) -> Shares:
     """Return the shares of a channel's squared gap, from held-out figures where available."""
     total = max(channel.gap_rms**2, 1e-300)
-    gap = after(channel) if channel.causes else channel.gap_rms
-    remaining = min(gap**2 / total, 1.0)
+    gap = after(channel)
+    remaining = min(gap**2 / total, 1.0) if channel.causes else 1.0  # also of no gap at all
     if not channel.structured:
         return Shares(1 - remaining, remaining, 0.0)
     floor = channel.noise_floor_rms or 0.0

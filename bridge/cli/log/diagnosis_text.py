@@ -21,7 +21,7 @@ VERDICTS = {
     Verdict.NO_GAP: "no gap: nothing stands above the noise",
     Verdict.EXPLAINED: "explained: causes were found, what is left has no structure",
     Verdict.PARTLY_EXPLAINED: "partly explained: causes were found, but residual structure remains",
-    Verdict.UNEXPLAINED: "unexplained: there is a gap that no effect of the catalogue accounts for",
+    Verdict.UNEXPLAINED: "unexplained: there is a gap, and no effect can be named as its cause",
 }
 MAX_SHOWN = 6  # next measurements
 MAX_CHANGED = 3  # parameters of a cause that changed between sessions

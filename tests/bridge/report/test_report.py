@@ -11,11 +11,21 @@ from gapbridge.bridge.document.drawing import Text
 from gapbridge.bridge.document.numbers import decimals_of, likelihood, number, percent, with_unit
 from gapbridge.bridge.document.skeleton import skeleton
 from gapbridge.bridge.report import SECTIONS, report_text
-from gapbridge.bridge.report.answer import picture
-from gapbridge.bridge.report.labels import VERDICTS, joint_list, listed, quantity_title
+from gapbridge.bridge.report.answer import picture, sentences
+from gapbridge.bridge.report.labels import (
+    VERDICTS,
+    effect_title,
+    joint_list,
+    listed,
+    quantity_title,
+    quantity_unit,
+)
 from gapbridge.bridge.report.material import SHOWN, shares, thinned, unexplained
 from gapbridge.bridge.report.parameters import measurements_table
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.causes import Considered, Outcome
+from gapbridge.core.diagnosis.channel_diagnosis import Verdict
+from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.model import Model
@@ -88,6 +98,26 @@ def test_shares_add_up_to_one(case):
         assert min(part.explained, part.noise, part.unexplained) >= 0
 
 
+def test_no_gap_at_all_is_not_called_explained():
+    channel = replace(diagnosed("no gap").diagnosis.channels[0], gap_rms=0.0)
+    assert shares(channel).explained == 0
+
+
+def test_what_fits_and_was_withdrawn_is_named_where_there_is_no_cause():
+    """A force sensor's zero under one attitude is in the catalogue; a load is as likely."""
+    channel = diagnosed("unexplained").diagnosis.channels[0]
+    assert channel.verdict is Verdict.UNEXPLAINED
+    why = Withdrawal(Check.SEPARATED, "payload")
+    fits = Considered("ft_bias", 0.99, 1.0, Outcome.WITHDRAWN, withdrawal=why)
+    no = Considered("ft_gain", 0.0, 0.0, Outcome.NOT_NEEDED)
+    (_, told, _) = sentences(replace(channel, considered=(no,)))
+    assert "its cause is not in the catalogue" in told
+    (_, told, _) = sentences(replace(channel, considered=(fits, no)))
+    assert effect_title("ft_bias") in told
+    assert effect_title("ft_gain") not in told
+    assert "not in the catalogue" not in told
+
+
 def test_what_a_quantity_predicts_is_not_called_noise():
     channel = diagnosed("partly explained").diagnosis.channels[0]
     blind = replace(channel, noise_floor_rms=channel.gap_rms, unexplained_rms=0.0)
@@ -145,3 +175,11 @@ def test_values_are_reported_in_the_units_that_people_use(text, wanted):
 
 def test_an_interval_is_reported_with_two_digits_of_its_width():
     assert (decimals_of(0.0123), decimals_of(1.23), decimals_of(250.0)) == (3, 1, 0)
+
+
+def test_an_outside_torque_is_not_in_newtons():
+    force, torque = "actual_TCP_force_0", "actual_TCP_force_4"
+    assert (quantity_title(force), quantity_unit(force)) == ("outside force x", ("N", 1.0))
+    assert (quantity_title(torque), quantity_unit(torque)) == (
+        "outside torque about y", ("Nm", 1.0),
+    )  # fmt: skip
