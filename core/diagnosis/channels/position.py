@@ -32,6 +32,8 @@ from gapbridge.core.motion import time_stretches
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 from gapbridge.core.sessions import session_of, sessions_in
 
+PLACE = "measured_position"
+MIN_PLACE = 0.02  # m: range of a coordinate of it that says where the arm is
 LEVER = 0.2  # m/rad: initial weight of a rotation relative to a position
 
 
@@ -82,7 +84,8 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     rows = np.concatenate([part.rows for part in parts])
     together = quantities(log, rows) | approaches(log.loads().approach, rows)
     for k in range(3):  # the sessions' frames differ: positions compare in base only
-        together[f"measured_position_{k}"] = np.concatenate([p.measured[:, k] for p in parts])
+        together[f"{PLACE}_{k}"] = np.concatenate([p.measured[:, k] for p in parts])
+    together = _without_plates(together)
     q = log.require("actual_q", "target_q")[rows]
     return _in_motion(stacked(parts, together, pose_groups(q)), log)
 
@@ -240,9 +243,22 @@ def quantities(log: Log, rows: NDArray[np.int64]) -> dict[str, Array]:
     q = "actual_q" if log.has("actual_q") else "target_q"
     named_columns = ((name, log.get(name)) for name in (
         "timestamp", "session", q, "payload", "payload_cog", "joint_temperatures",
-        "actual_TCP_force", "measured_position",
+        "actual_TCP_force", PLACE,
     ))  # fmt: skip
-    return varying({name: column[rows] for name, column in named_columns if column is not None})
+    return _without_plates(
+        varying({name: column[rows] for name, column in named_columns if column is not None})
+    )
+
+
+def _without_plates(quantities: dict[str, Array]) -> dict[str, Array]:
+    """Return the quantities but coordinates of measured positions that hardly change.
+
+    On a plate one changes by gap and noise alone, which would seem to depend on it.
+    """
+    return {
+        name: values for name, values in quantities.items()
+        if not name.startswith(PLACE) or np.ptp(values) > MIN_PLACE
+    }  # fmt: skip
 
 
 def approaches(approach: Array | None, rows: NDArray[np.int64] | None = None) -> dict[str, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -52,6 +53,9 @@ def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observatio
     part = motion.pick(rows)
     n, target = model.arm.n, motion.target_q
     assert target is not None
+    # the commanded angles: an encoder's noise is in its reading, on which that of a joint at rest
+    # would depend
+    commanded = replace(part, q=target[rows])
     return Observation(
         channel="tracking",
         unit="rad",
@@ -61,7 +65,7 @@ def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observatio
         weight=np.ones(n),
         sigma=encoder_step(log.require("actual_q")) / np.sqrt(12),
         sigma_is_whole=False,
-        quantities=held_torques(part) | quantities(log, part),
+        quantities=held_torques(part) | quantities(log, commanded),
         groups=conditions(part),
         rows=part.rows,
         axes=joint_axes(n),

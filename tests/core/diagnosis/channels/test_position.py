@@ -15,6 +15,7 @@ from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import ChannelFinding, Check, NotAccused
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
+from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
@@ -201,3 +202,21 @@ def test_too_few_rows_are_refused_with_what_each_channel_needs():
         LogError, match=r"position: at least 4 rows \(found 3\); wrench: ft_raw_wrench"
     ):
         small.diagnose(small.model_of(), log, Metrology(sigma=small.SIGMA))
+
+
+@pytest.mark.parametrize("sessions", [1, 2])
+def test_poses_on_a_plate_depend_on_nothing(sessions):
+    """The height is measured as that of the plate, and varies by noise alone: so does the gap."""
+    model, structured = small.model_of(), []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        q = np.column_stack([rng.uniform(-2, 2, 60), np.full(60, 0.7), np.full(60, -1.1)])
+        position = model.predict(q).position + rng.normal(0, small.SIGMA, (60, 3))
+        columns = {"actual_q": q, "measured_position": position}
+        if sessions > 1:
+            columns["session"] = np.repeat(np.arange(sessions), 60 // sessions)
+        log = Log("plate.csv", columns, 3)
+        (channel,) = diagnose(model, log, Metrology(registered=True, sigma=small.SIGMA)).channels
+        assert "measured_position_0" in channel.selection.observation.quantities
+        structured.append(channel.structured)
+    assert not any(structured)

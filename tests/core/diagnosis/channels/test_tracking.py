@@ -193,3 +193,16 @@ def test_what_no_encoder_resolves_is_no_gap():
         (channel,) = diagnose(MODEL, log, METROLOGY).channels
         assert channel.structured == structured
         assert (channel.verdict == "no_gap") != structured
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.01])
+def test_joints_at_rest_depend_on_nothing_beside_joints_that_move(delay):
+    """A joint at rest reads its encoder's noise alone, on which its own residual would depend."""
+    t = times(50)
+    target, actual = COURSE.at(t), COURSE.at(t)
+    actual[:, 0] = COURSE.at(t - delay)[:, 0]
+    target[:, 3:] = actual[:, 3:] = target[0, 3:]
+    (channel,) = diagnose(MODEL, log_of(actual, target, t, noise=5e-5)).channels
+    assert not channel.structured
+    named = [(cause.effect, cause.joints) for cause in channel.causes]
+    assert named == ([("latency", (1,))] if delay else [])
