@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -28,6 +27,7 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, motion_of
 from gapbridge.core.sessions import session_of
 
+MIN_TURN = 0.05  # rad, commanded range of a joint on whose angle the gap may depend
 MIN_LEAD = 0.1  # s left out at the start of each stretch, where past commands are unknown
 DECIMALS = 2e-7  # rad: smaller differences are rounding of the log
 CACHED = 64  # predictions of one joint
@@ -53,9 +53,9 @@ def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observatio
     part = motion.pick(rows)
     n, target = model.arm.n, motion.target_q
     assert target is not None
-    # the commanded angles: an encoder's noise is in its reading, on which that of a joint at rest
-    # would depend
-    commanded = replace(part, q=target[rows])
+    # of a joint that rests the reading is its encoder's noise, as its gap is: it would depend on it
+    resting = [f"actual_q_{j}" for j in np.flatnonzero(np.ptp(target[rows], axis=0) < MIN_TURN)]
+    known = held_torques(part) | quantities(log, part)
     return Observation(
         channel="tracking",
         unit="rad",
@@ -65,7 +65,7 @@ def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observatio
         weight=np.ones(n),
         sigma=encoder_step(log.require("actual_q")) / np.sqrt(12),
         sigma_is_whole=False,
-        quantities=held_torques(part) | quantities(log, commanded),
+        quantities={name: z for name, z in known.items() if name not in resting},
         groups=conditions(part),
         rows=part.rows,
         axes=joint_axes(n),
