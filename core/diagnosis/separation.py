@@ -101,7 +101,8 @@ def next_measurements(
                 continue
             gain = np.linalg.norm(difference, axis=1) / sigma
             chosen += _best(moving, trials, question.separates, gain)
-    return tuple(chosen)
+    # one pose may answer the same question of several joints
+    return tuple({(m.q, m.separates): m for m in chosen}.values())
 
 
 def _noise(channel: ChannelDiagnosis) -> float:

@@ -118,6 +118,14 @@ def test_the_same_question_gets_the_same_answer(tied):
     assert again[0] != next_measurements(model, log, tied.channels, seed=5)
 
 
+def test_a_pose_that_answers_the_same_question_of_two_joints_is_listed_once(tied, monkeypatch):
+    model, log = small.model_of(), small.log_of(small.session_of(3, ONE_SIDED), np.zeros((60, 3)))
+    once, questions = next_measurements(model, log, tied.channels), separation._open_questions
+    monkeypatch.setattr(separation, "_open_questions", lambda *given: [*questions(*given)] * 2)
+    assert once
+    assert next_measurements(model, log, tied.channels) == once
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     low=st.floats(-9, 3), width=st.floats(0.05, 9), open_below=st.booleans(), seed=st.integers(0, 9)
