@@ -39,6 +39,13 @@ UNIT_ERRORS = {
 }
 REDUNDANCY = {"distance": 4, "relative": 9}
 """Equations beyond the unknowns, by kind, that are needed to locate the instrument reliably."""
+RANGES = {
+    "position": (MIN_DISTANCE, MAX_RANGE, "from the instrument's origin"),
+    "pose": (MIN_DISTANCE, MAX_RANGE, "from the instrument's origin"),
+    "distance": (0.0, MAX_RANGE, "from the fixed end"),
+    "relative": (MIN_DISTANCE, MAX_BALL_DISTANCE, "between the balls"),
+}
+"""Smallest and largest plausible length of a reading, m, by kind, and what it is."""
 AXIS_ORDERS = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))
 AXES = "xyz"
 
@@ -211,71 +218,32 @@ def check_without_fit(before: Readings, new: Readings, tcp: Array) -> Verdict | 
 
     ``tcp`` (N + 1, 3) m, in base: of the cell's model, at the N readings before and the new one.
     """
-    value = new.value[0, :3]
-    match new.kind:
-        case "position" | "pose":
-            return _check_position(before, value, tcp)
-        case "distance":
-            return _check_distance(before, float(value[0]), tcp)
-        case "relative":
-            return _check_ball_distance(before, value)
-    return None
-
-
-def _check_position(before: Readings, value: Array, tcp: Array) -> Verdict | None:
-    distance = float(np.linalg.norm(value))
-    failed = _check_range(distance, MIN_DISTANCE, MAX_RANGE, "from the instrument's origin")
-    if failed is not None:
-        return failed
-    for i, earlier in enumerate(before.value[:, :3]):
-        apart = float(np.linalg.norm(value - earlier))
-        expected = float(np.linalg.norm(tcp[-1] - tcp[i]))
-        limit = TOLERANCE + RELATIVE_TOLERANCE * expected
-        if abs(apart - expected) > limit:
-            explanation = (
-                f"it is {1e3 * apart:.1f} mm from an earlier reading here; the joints put the two "
-                f"{1e3 * expected:.0f} mm apart"
-            )
-            return Verdict(abs(apart - expected), limit, True, (explanation,))
-    return None
-
-
-def _check_distance(before: Readings, value: float, tcp: Array) -> Verdict | None:
-    failed = _check_range(abs(value), 0.0, MAX_RANGE, "from the fixed end")
-    if failed is not None:
-        return failed
-    for i, earlier in enumerate(before.value[:, 0]):
-        expected = float(np.linalg.norm(tcp[-1] - tcp[i]))
-        change = abs(value - float(earlier))
-        limit = expected + TOLERANCE + RELATIVE_TOLERANCE * expected
-        if change > limit:
-            explanation = (
-                f"it differs by {1e3 * change:.1f} mm from an earlier reading; the joints put the "
-                f"two {1e3 * expected:.0f} mm apart"
-            )
-            return Verdict(change, limit, True, (explanation,))
-    return None
-
-
-def _check_ball_distance(before: Readings, value: Array) -> Verdict | None:
-    distance = float(np.linalg.norm(value))
-    failed = _check_range(distance, MIN_DISTANCE, MAX_BALL_DISTANCE, "between the balls")
-    if failed is not None:
-        return failed
-    for earlier in before.value:
-        apart = float(np.linalg.norm(earlier))
-        limit = BALL_TOLERANCE + RELATIVE_BALL_TOLERANCE * apart
-        if abs(distance - apart) > limit:
-            explanation = (
-                f"the balls are {1e3 * distance:.1f} mm apart, {1e3 * apart:.1f} mm before"
-            )
-            return Verdict(abs(distance - apart), limit, True, (explanation,))
-    return None
-
-
-def _check_range(value: float, low: float, high: float, what: str) -> Verdict | None:
-    if low <= value <= high:
+    if new.kind not in RANGES:
         return None
-    side, limit = ("at least", low) if value < low else ("at most", high)
-    explanation = f"{1e3 * value:.3f} mm {what}, expected {side} {1e3 * limit:.0f} mm"
-    return Verdict(abs(value - limit), 0.0, True, (explanation,))
+    value = new.value[0, :3]
+    distance = float(np.linalg.norm(value))
+    low, high, what = RANGES[new.kind]
+    if not low <= distance <= high:
+        side, limit = ("at least", low) if distance < low else ("at most", high)
+        explanation = f"{1e3 * distance:.3f} mm {what}, expected {side} {1e3 * limit:.0f} mm"
+        return Verdict(abs(distance - limit), 0.0, True, (explanation,))
+    for earlier, place in zip(before.value[:, :3], tcp, strict=False):
+        apart = float(np.linalg.norm(value - earlier))
+        moved = float(np.linalg.norm(tcp[-1] - place))
+        limit = TOLERANCE + RELATIVE_TOLERANCE * moved
+        joints = f"the joints put the two {1e3 * moved:.0f} mm apart"
+        if new.kind == "relative":
+            known = float(np.linalg.norm(earlier))
+            off, limit = abs(distance - known), BALL_TOLERANCE + RELATIVE_BALL_TOLERANCE * known
+            explanation = (
+                f"the balls are {1e3 * distance:.1f} mm apart, {1e3 * known:.1f} mm before"
+            )
+        elif new.kind == "distance":  # changes by no more than the target moves
+            off, limit = apart, moved + limit
+            explanation = f"it differs by {1e3 * apart:.1f} mm from an earlier reading; {joints}"
+        else:
+            off = abs(apart - moved)
+            explanation = f"it is {1e3 * apart:.1f} mm from an earlier reading here; {joints}"
+        if off > limit:
+            return Verdict(off, limit, True, (explanation,))
+    return None
