@@ -114,22 +114,18 @@ def _key_differences(keys: tuple[str | int, ...], one: Any, other: Any) -> Itera
         yield KeyChange(key_path(keys), one, other, in_model=keys[0] in MODEL_KEYS)
 
 
-def tcp_shift(before: Cell, after: Cell, q: Array | None = None, loads: Loads | None = None,
-              seed: int = 0) -> TcpShift | None:  # fmt: skip
-    """Return how far the predicted TCP moves from one cell to the other.
+def tcp_shift(before: Cell, after: Cell, q: Array, loads: Loads | None) -> TcpShift | None:
+    """Return how far the predicted TCP moves from one cell to the other at ``q`` (N, n), rad.
 
-    ``q`` (N, n) in rad; left out: random poses within the joint limits, under each cell's payload.
-    Poses without equilibrium are left out. None if the arms have different numbers of joints, or
-    no pose has an equilibrium.
+    Without ``loads`` under each cell's payload. Poses without equilibrium are left out. None if the
+    arms have different numbers of joints, or no pose has an equilibrium.
     """
     if before.arm.n != after.arm.n:
         return None
-    q = _random_poses(before, seed) if q is None else q
     return _model_shift(before.model, after.model, q, loads)
 
 
-def part_changes(before: Cell, after: Cell, q: Array | None = None, loads: Loads | None = None,
-                 seed: int = 0) -> list[PartChange]:  # fmt: skip
+def part_changes(before: Cell, after: Cell, q: Array, loads: Loads | None) -> list[PartChange]:
     """Return the parts in which the models differ, sorted by the shift of the TCP, largest first.
 
     Each part alone is replaced in the model of ``before``, over the poses of ``tcp_shift``. Empty
@@ -138,7 +134,6 @@ def part_changes(before: Cell, after: Cell, q: Array | None = None, loads: Loads
     if before.arm.n != after.arm.n:
         return []
     old, new = before.model, after.model
-    q = _random_poses(before, seed) if q is None else q
     parts = [
         PartChange(
             name, _model_shift(old, replace(old, **{k: getattr(new, k) for k in keys}), q, loads)
@@ -165,7 +160,7 @@ def _terms_by_site(model: Model) -> dict[tuple[str, Site], tuple[Term, ...]]:
     return found
 
 
-def _random_poses(cell: Cell, seed: int) -> Array:
+def random_poses(cell: Cell, seed: int) -> Array:
     """Return random poses (POSES, n) within the joint limits, rad."""
     limits = cell.arm.limits
     low, high = np.maximum(limits.lower, -MAX_ANGLE), np.minimum(limits.upper, MAX_ANGLE)

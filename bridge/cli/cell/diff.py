@@ -17,6 +17,7 @@ from gapbridge.bridge.cell.difference import (
     TcpShift,
     key_changes,
     part_changes,
+    random_poses,
     tcp_shift,
 )
 from gapbridge.bridge.cell.opened_log import open_log
@@ -47,10 +48,10 @@ def diff(before: Path, after: Path, log: Path | None, seed: int, as_json: bool) 
     one, other = open_cell(before), open_cell(after)
     changes = key_changes(one, other)
     rows = None if log is None else open_log(log, one)
-    q = None if rows is None else rows.require("actual_q", "target_q")
+    q = random_poses(one, seed) if rows is None else rows.require("actual_q", "target_q")
     loads = None if rows is None else rows.loads()
-    shift = tcp_shift(one, other, q, loads, seed)
-    parts = part_changes(one, other, q, loads, seed)
+    shift = tcp_shift(one, other, q, loads)
+    parts = part_changes(one, other, q, loads)
     if as_json:
         reported = {
             "changes": [change.to_json() for change in changes],
