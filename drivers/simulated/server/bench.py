@@ -111,12 +111,8 @@ class BenchServer:
 
     def handle(self, connection: Connection) -> None:
         """Answer every complete line."""
-        while connection.open and b"\n" in connection.received:
-            end = connection.received.index(b"\n")
-            line = connection.received[:end].decode("utf-8", "replace").strip()
-            del connection.received[: end + 1]
-            if line:
-                connection.send(self.answer(line).encode() + b"\n")
+        for line in connection.lines():
+            connection.send(self.answer(line).encode() + b"\n")
 
     def answer(self, line: str) -> str:
         """Return the reply to one command; a mistake is reported as ``error: ...``."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 SEND_BUFFER = 65536  # bytes the kernel may hold for a client that does not read
@@ -67,6 +68,14 @@ class Connection:
         if not data or len(self.received) > MOST_INPUT:
             self.close()
         return self.open
+
+    def lines(self) -> Iterator[str]:
+        """Take every complete line that is not blank, until the connection is closed."""
+        while self.open and b"\n" in self.received:
+            line, _, rest = self.received.partition(b"\n")
+            self.received = rest
+            if text := line.decode("utf-8", "replace").strip():
+                yield text
 
     def send(self, data: bytes) -> None:
         """Send `data` after everything pending; a client that does not read is closed."""

@@ -59,12 +59,7 @@ class DashboardServer:
 
     def handle(self, connection: Connection) -> None:
         """Answer every complete line."""
-        while connection.open and b"\n" in connection.received:
-            end = connection.received.index(b"\n")
-            line = connection.received[:end].decode("utf-8", "replace").strip()
-            del connection.received[: end + 1]
-            if not line:
-                continue
+        for line in connection.lines():
             if line.lower() in ("quit", "shutdown"):
                 parting = b"Disconnected\n" if line.lower() == "quit" else b"Shutting down\n"
                 connection.send(parting)
