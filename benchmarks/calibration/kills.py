@@ -29,7 +29,7 @@ import numpy as np
 
 from benchmarks.calibration.children import PYTHON, Child, Start, environment, forked, started
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
-from gapbridge.bridge.calibration.session.plan_document import plan_of
+from gapbridge.bridge.calibration.session.session import plan_of
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model

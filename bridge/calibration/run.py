@@ -32,10 +32,9 @@ from gapbridge.bridge.calibration.planning import (
 from gapbridge.bridge.calibration.session.folders import check_start, session_folder, start_entry
 from gapbridge.bridge.calibration.session.journal import Journal
 from gapbridge.bridge.calibration.session.measuring import Measuring
-from gapbridge.bridge.calibration.session.plan_document import write_poses
 from gapbridge.bridge.calibration.session.positioning import CollisionCheck, Positioning
 from gapbridge.bridge.calibration.session.prompt import InputEnded, Prompt, SessionCommand
-from gapbridge.bridge.calibration.session.session import Session
+from gapbridge.bridge.calibration.session.session import Session, write_poses
 from gapbridge.bridge.cell import Cell
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose

@@ -1,8 +1,9 @@
-"""State of a session, replayed from its journal, and its progress."""
+"""State of a session, replayed from its journal: its plan, readings and progress."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -10,12 +11,13 @@ import numpy as np
 
 from gapbridge.bridge.calibration.format import duration
 from gapbridge.bridge.calibration.session.journal import Entry, Journal
-from gapbridge.bridge.calibration.session.plan_document import entry_of, plan_of
+from gapbridge.bridge.document.output_file import write_table
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.plan import Plan, PlannedPose
+from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import InputError
 from gapbridge.core.loads import Loads
+from gapbridge.core.notes import Note, Reason
 
 _VECTORS = ("q", "value", "approach", "temperature", "wrench", "raw_wrench")
 DEFAULT_INTERVAL = 60.0  # s per stop, before the first two readings
@@ -54,7 +56,7 @@ class Reading:
         known = {k: v for k, v in entry.items() if k in cls.__dataclass_fields__}
         for name in _VECTORS:
             if name in known:
-                known[name] = np.array([float(v) for v in known[name]])
+                known[name] = _array(known[name])
         known["scatter"] = float(known["scatter"])
         return cls(**known)
 
@@ -257,3 +259,51 @@ def stop_header(session: Session, stop: int, minutes_per_load: float) -> str:
         [f"{bar:░<{BAR_WIDTH}} stop {stop + 1} of {count}", f"load {pose.load + 1}", *details,
          f"{duration(seconds_left(session, minutes_per_load))} left"]
     )  # fmt: skip
+
+
+def plan_of(entry: dict[str, Any]) -> Plan:
+    """Return the plan of a journal entry."""
+    expected = entry["expected"]
+    return Plan(
+        loads=tuple(
+            Payload(float(p["mass"]), _vector3(p["cog"]), str(p["name"])) for p in entry["loads"]
+        ),
+        poses=tuple(_pose(p) for p in entry["poses"]),
+        expected=Expectation(
+            names=tuple(expected["names"]), units=tuple(expected["units"]),
+            std=_array(expected["std"]), prior=_array(expected["prior"]),
+            tcp_std=float(expected["tcp_std"]), tcp_std_worst=float(expected["tcp_std_worst"]),
+        ),
+        bought=tuple((int(n), float(s)) for n, s in entry["bought"]),
+        travel=float(entry["travel"]),
+        notes=tuple(Note(Reason[name], tuple(values)) for name, values in entry["notes"]),
+    )  # fmt: skip
+
+
+def entry_of(plan: Plan) -> dict[str, Any]:
+    """Return the journal entry of a plan."""
+    return {**asdict(plan), "notes": [(note.reason.name, note.values) for note in plan.notes]}
+
+
+def _pose(entry: dict[str, Any]) -> PlannedPose:
+    return PlannedPose(**{**entry, "q": _array(entry["q"]), "approach": _array(entry["approach"])})
+
+
+def _array(values: list[Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    return np.array([float(v) for v in values])
+
+
+def _vector3(values: list[Any]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+def write_poses(plan: Plan, path: Path) -> None:
+    """Write the stops as CSV in the order of travel: stop (from 1), place, load, joints in rad."""
+    n = len(plan.poses[0].q)
+    rows = [
+        (i + 1, p.number, p.station, p.load, plan.loads[p.load].mass, p.held_out, p.repeat, *p.q)
+        for i, p in enumerate(plan.poses)
+    ]
+    names = ["stop", "pose", "place", "load", "payload", "held_out", "repeat"]
+    write_table(path, [*names, *(f"target_q_{i}" for i in range(n))], np.array(rows, dtype=float))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
-from gapbridge.bridge.calibration.session.plan_document import plan_of
+from gapbridge.bridge.calibration.session.session import plan_of
 from gapbridge.bridge.cli import main
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.plan import Plan

@@ -22,8 +22,7 @@ from gapbridge.bridge.calibration.session.journal import (
     plain,
     read_entries,
 )
-from gapbridge.bridge.calibration.session.plan_document import entry_of, plan_of
-from gapbridge.bridge.calibration.session.session import Reading, Session
+from gapbridge.bridge.calibration.session.session import Reading, Session, entry_of, plan_of
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.errors import InputError, RunError
