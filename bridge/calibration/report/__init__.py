@@ -1,7 +1,6 @@
 """Reports of calibration sessions for customers, as HTML and PDF."""
 
-from gapbridge.bridge.calibration.report.data import CalibrationData
-from gapbridge.bridge.calibration.report.facts import InstrumentFacts, SessionFacts
+from gapbridge.bridge.calibration.report.data import CalibrationData, InstrumentFacts, SessionFacts
 from gapbridge.bridge.calibration.report.report import write_report
 from gapbridge.bridge.calibration.report.sections.result_section import required_accuracy
 from gapbridge.bridge.calibration.report.sections.short_sections import ShortSessionData

@@ -1,13 +1,14 @@
-"""The data of a calibration's report, and the errors that its sections share."""
+"""The data of a session's report: its facts, and the errors that the sections share."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
-from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.document.blocks import DOUBTFUL, GOOD, Badge
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.budget.budget import Budget, budget
@@ -23,6 +24,41 @@ ERROR_DEFINITIONS = {
     "point": "the predicted distance of the tip from the fixed point that it touched",
     "relative": "the difference between the measured and the predicted vector between the balls",
 }
+
+
+@dataclass(frozen=True)
+class InstrumentFacts:
+    """The instrument by its data sheet, its certificate and the operator."""
+
+    name: str
+    kind: str = "position"  # key of core.calibration.observables.OBSERVABLES
+    serial: str = ""
+    certificate: str = ""  # number or date of its own calibration
+    sigma: float = 2.0e-5  # m, 1 sigma of one coordinate of a single reading, as declared
+    distance: float = 0.0  # m, usual distance from the instrument to the target
+
+
+@dataclass(frozen=True)
+class SessionFacts:
+    """One session; the report omits empty fields."""
+
+    cell: str  # name of the cell
+    arm: str
+    instrument: InstrumentFacts
+    folder: Path  # of the session
+    started: datetime
+    ended: datetime
+    readings: int  # accepted ones
+    undone: int = 0  # discarded by the operator
+    serial: str = ""  # of the arm
+    operator: str = ""
+    customer: str = ""
+    environment: str = ""  # temperature, place, ...
+    number: str = ""  # of the report
+    version: str = ""  # of Gapbridge
+    cell_sha256: str = ""  # of the cell file that was calibrated
+    accuracy: float | None = None  # m, required; None: no requirement
+    remarks: tuple[str, ...] = ()  # notes and irregularities
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gapbridge.bridge.calibration.report.data import CalibrationData
-from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.bridge.calibration.report.data import CalibrationData, SessionFacts
 from gapbridge.bridge.calibration.report.sections.errors_section import (
     before_and_after,
     over_the_workspace,

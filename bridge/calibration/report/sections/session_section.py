@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gapbridge.bridge.calibration.report.data import CalibrationData
-from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.bridge.calibration.report.data import CalibrationData, SessionFacts
 from gapbridge.bridge.document.blocks import Block, Bullets, Columns, Heading, Pairs
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.bridge.document.numbers import load_title, mm, plain

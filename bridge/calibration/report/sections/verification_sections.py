@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gapbridge.bridge.calibration.format import verdict_text
-from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.bridge.calibration.report.data import SessionFacts
 from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
 from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
 from gapbridge.bridge.document import blocks
