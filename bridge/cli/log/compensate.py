@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from gapbridge.bridge.api.envelope import joint_offsets
 from gapbridge.bridge.api.functions import compensate as compensate_log
+from gapbridge.bridge.api.functions import joint_offsets
 from gapbridge.bridge.cli.log.large_log import pieces_of
 from gapbridge.bridge.cli.options import (
     cell_option,

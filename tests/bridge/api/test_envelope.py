@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gapbridge.bridge.api.envelope import above
+from gapbridge.bridge.api.functions import above
 
 
 @given(st.floats(1e-9, 10.0), st.floats(1e-12, 1.0), st.sampled_from([1.0, 1e3]))
