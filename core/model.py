@@ -148,16 +148,10 @@ class Model:
 
     def condition(self, rows: Rows, loads: Loads, q: Array, terms: Sequence[Term]) -> None:
         """Change ``rows`` in place by ``terms``; ``q`` is (N, n) encoder angles."""
-        if terms:
-            relative = self._relative_temperatures(loads)
-            for term in terms:
-                CATALOGUE[term.effect].condition(term, self.arm, rows, relative, q)
-
-    def _relative_temperatures(self, loads: Loads) -> Loads:
-        """Return loads with temperatures relative to the reference."""
-        if loads.temperature is None:
-            return loads
-        return replace(loads, temperature=loads.temperature - self.reference_temperature)
+        if terms and loads.temperature is not None:  # relative to the reference
+            loads = replace(loads, temperature=loads.temperature - self.reference_temperature)
+        for term in terms:
+            CATALOGUE[term.effect].condition(term, self.arm, rows, loads, q)
 
     def predict(self, q: Array, loads: Loads | None = None) -> Poses:
         """Return the TCP poses in base for encoder angles ``q`` (N, n): the exact equilibrium.

@@ -14,7 +14,7 @@ from gapbridge.bridge.cell.effects import compliance_terms, effect_terms
 from gapbridge.bridge.cell.message import error_lines, located, located_message, message_at
 from gapbridge.bridge.cell.plausibility import check_plausibility
 from gapbridge.bridge.cell.robot import build_arm
-from gapbridge.bridge.cell.schema import CauseEntry, CellFile, Simulation
+from gapbridge.bridge.cell.schema import CauseEntry, CellFile
 from gapbridge.bridge.cell.sections import (
     LimitSettings,
     LinkSettings,
@@ -162,11 +162,6 @@ class Cell:
             ("payload", "mass"),
             f"found {mass:g} kg and {added:g} kg of the effects, expected 0 kg or more together",
         )
-
-    @property
-    def simulation(self) -> Simulation:
-        """Return section ``simulation``."""
-        return self.file.simulation
 
 
 def load_cell(path: Path | str) -> Cell:

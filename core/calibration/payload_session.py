@@ -15,23 +15,20 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.effects import CATALOGUE, Site, Term, acting, correcting
+from gapbridge.core.effects.effect import WRENCH_AXES as AXES
 from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.estimation.robust import robust_fit
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
-from gapbridge.core.motion import Motion, motion_of
+from gapbridge.core.motion import motion_of
 from gapbridge.core.notes import Note, Reason
 
-AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 (BIAS,) = correcting("sensor zero")
 NAMES = ("payload_mass", *(f"payload_cog_{k}" for k in "xyz"), *(f"{BIAS}_{k}" for k in AXES))
 UNITS = ("kg", "m", "m", "m", "N", "N", "N", "Nm", "Nm", "Nm")
 MIN_MASS_SIGMAS = 3.0  # below it the centre of gravity is undetermined
 MIN_READINGS = 3
-MAX_NOISE = (
-    10.0,
-    1.0,
-)  # N, Nm, 1 sigma of a reading about load and bias: no sensor at rest has more
+MAX_NOISE = (10.0, 1.0)  # N, Nm, 1 sigma about load and bias: no sensor at rest has more
 MIN_CHANGE = (0.5, 0.05)  # N, Nm from pose to pose, that no axis of a sensor overlooks
 NOISE_SHARE = 0.1  # the same of the readings' change from pose to pose, for heavy loads
 
@@ -77,15 +74,12 @@ def weight_columns(model: Model, q: Array) -> Array:
     scaling = [t for t in model.terms if CATALOGUE[t.effect].scales_reading]
     motion = motion_of(Log("readings", {"actual_q": q}, model.arm.n))
     for k in range(4):
-        columns[:, :, k] = _sensor_reading(model, scaling, columns[:, :, k], motion)
+        for term in acting(scaling, "wrench"):
+            columns[:, :, k] = CATALOGUE[term.effect].sense(
+                term, model.arm, columns[:, :, k], motion
+            )
     columns[:, :, 4:] = np.eye(6)
     return columns
-
-
-def _sensor_reading(model: Model, scaling: list[Term], wrench: Array, motion: Motion) -> Array:
-    for term in acting(scaling, "wrench"):
-        wrench = CATALOGUE[term.effect].sense(term, model.arm, wrench, motion)
-    return wrench
 
 
 def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibration:

@@ -62,7 +62,7 @@ def calibrate_tool(model: Model, q: Array, loads: Loads | None = None) -> ToolCa
     _check_shapes(model, q)
     position, rotation = flange_poses(model, q, loads)
     nominal = model.chain().tool_position
-    point = _common_point(position, rotation, nominal)
+    point = np.asarray(np.median(position + rotation @ nominal, axis=0))  # of the tips, in base
     before = np.concatenate([nominal, point])
     values, fit = _fit_tip(position, rotation, before)
     if fit.noise[0] > MAX_NOISE:
@@ -109,11 +109,6 @@ def _check_shapes(model: Model, q: Array) -> None:
         raise ExcitationError(
             f"tool session: found {len(q)} touch(es), expected {MIN_READINGS} or more orientations"
         )
-
-
-def _common_point(position: Array, rotation: Array, tcp: Array) -> Array:
-    """Return the median tip position (3,), m, base."""
-    return np.asarray(np.median(position + rotation @ tcp, axis=0))
 
 
 def _fit_tip(position: Array, rotation: Array, values: Array) -> tuple[Array, RobustFit]:

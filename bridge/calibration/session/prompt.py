@@ -13,6 +13,8 @@ from typing import TypeVar
 from rich.console import Console
 from rich.status import Status
 
+from gapbridge.bridge.report.labels import listed
+
 T = TypeVar("T")
 POLL_INTERVAL = 0.1  # s
 COMMANDS = {
@@ -94,7 +96,7 @@ class Prompt:
             matching = [k for k in answers if answer and k.startswith(answer)]
             if matching or not answer:
                 return matching[0] if matching else first
-            self.say(f"found {answer!r}, expected {_either(list(shown))}")
+            self.say(f"found {answer!r}, expected {listed([*shown], 'or')}")
 
     @contextmanager
     def waiting(self, text: str) -> Iterator[Callable[[str], None]]:
@@ -144,10 +146,6 @@ class Prompt:
         if name in COMMANDS:
             raise SessionCommand(name)
         return line
-
-
-def _either(choices: list[str]) -> str:
-    return choices[0] if len(choices) == 1 else f"{', '.join(choices[:-1])} or {choices[-1]}"
 
 
 class _InputLines:

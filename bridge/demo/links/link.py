@@ -62,7 +62,7 @@ class DemoLink(ABC):
     @property
     def home(self) -> Array:
         """Return the arm's start pose (n,), rad."""
-        return np.array(self.cell.simulation.start_q)
+        return np.array(self.cell.file.simulation.start_q)
 
     @contextmanager
     def served(self) -> Iterator[None]:

@@ -68,8 +68,8 @@ def test_poses_are_within_the_arms_limits_and_there_are_enough(link: DemoLink, s
 def test_what_is_hidden_stands_in_no_cell_that_the_run_reads(link: DemoLink) -> None:
     declared = link.declared(link.cell, link.experiment.test_loads[0])
     for cell in (link.cell, declared):
-        assert cell.simulation.compliance is None
-        assert cell.simulation.tool_shift is None
+        assert cell.file.simulation.compliance is None
+        assert cell.file.simulation.tool_shift is None
         assert cell.model.terms == ()
     assert declared.model.payload_mass == link.experiment.test_loads[0].mass
     assert declared.model.payload_cog.tolist() == list(link.experiment.test_loads[0].cog)

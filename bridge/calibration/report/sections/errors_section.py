@@ -100,7 +100,8 @@ def over_the_workspace(data: CalibrationData) -> list[Block]:
     size = float(np.ptp(tcp, axis=0).max())
     drawings, factors = [], []
     for name, errors, colour in (("Before", before, BEFORE), ("After", after, AFTER)):
-        factor = _arrow_scale(errors, size)
+        large = max(float(np.quantile(errors.norm, 0.95)), 1e-9)
+        factor = round_factor(ARROW_LENGTH * size / large)
         factors.append(factor)
         for view, axes in ERROR_VIEWS.items():
             title = f"{name}, {view}"
@@ -111,12 +112,6 @@ def over_the_workspace(data: CalibrationData) -> list[Block]:
         f" errors after {factors[1]:,.0f} times. Axes of the base; the square is the base."
     )
     return [Paragraph(about, "note"), Pictures(tuple(drawings), caption), zones]
-
-
-def _arrow_scale(errors: Errors, size: float) -> float:
-    """Return a round magnification that draws a large error at ARROW_LENGTH."""
-    rough = ARROW_LENGTH * size / max(float(np.quantile(errors.norm, 0.95)), 1e-9)
-    return round_factor(rough)
 
 
 def _view(
