@@ -8,35 +8,21 @@ from __future__ import annotations
 from typing import Any
 
 # runtime_state
-STOPPING, STOPPED, PLAYING, PAUSED = 0, 1, 2, 4
+STOPPED, PLAYING, PAUSED = 1, 2, 4
 
 # robot_mode
 POWER_OFF, POWER_ON, IDLE, BACKDRIVE, RUNNING = 3, 4, 5, 6, 7
-ROBOT_MODE_NAMES = {
-    -1: "NO_CONTROLLER",
-    0: "DISCONNECTED",
-    1: "CONFIRM_SAFETY",
-    2: "BOOTING",
-    POWER_OFF: "POWER_OFF",
-    POWER_ON: "POWER_ON",
-    IDLE: "IDLE",
-    BACKDRIVE: "BACKDRIVE",
-    RUNNING: "RUNNING",
-}
+ROBOT_MODE_NAMES = dict(enumerate((
+    "NO_CONTROLLER", "DISCONNECTED", "CONFIRM_SAFETY", "BOOTING", "POWER_OFF", "POWER_ON", "IDLE",
+    "BACKDRIVE", "RUNNING",
+), -1))  # fmt: skip
 
 # safety_mode
 SAFETY_NORMAL, SAFETY_REDUCED, SAFETY_PROTECTIVE, SAFETY_ROBOT_EMERGENCY = 1, 2, 3, 7
-SAFETY_MODE_NAMES = {
-    1: "NORMAL",
-    2: "REDUCED",
-    3: "PROTECTIVE_STOP",
-    4: "RECOVERY",
-    5: "SAFEGUARD_STOP",
-    6: "SYSTEM_EMERGENCY_STOP",
-    7: "ROBOT_EMERGENCY_STOP",
-    8: "VIOLATION",
-    9: "FAULT",
-}
+SAFETY_MODE_NAMES = dict(enumerate((
+    "NORMAL", "REDUCED", "PROTECTIVE_STOP", "RECOVERY", "SAFEGUARD_STOP", "SYSTEM_EMERGENCY_STOP",
+    "ROBOT_EMERGENCY_STOP", "VIOLATION", "FAULT",
+), 1))  # fmt: skip
 
 #: safety_status_bits: 0 normal, 1 reduced, 2 protective stop, 6 robot emergency, 7 emergency,
 #: 10 stopped due to safety.

@@ -89,23 +89,9 @@ def _configuration(controller: Controller, rows: Rows) -> bytes:
     bounds = [v for pair in zip(arm.lower, arm.upper, strict=True) for v in pair]
     speeds = [v for speed in arm.velocity for v in (speed, 5.0)]
     general = (1.05, 1.4, 0.25, 1.2, 0.25)  # v_joint, a_joint, v_tool, a_tool, eq_radius
-    return _part(
-        CONFIGURATION,
-        struct.pack(
-            ">12d12d5d24d4i",
-            *bounds,
-            *speeds,
-            *general,
-            *a,
-            *d,
-            *alpha,
-            *theta,
-            0,
-            0,
-            ROBOT_TYPES.get(arm.name.rstrip("e"), 0),
-            0,
-        ),
-    )
+    kind = ROBOT_TYPES.get(arm.name.rstrip("e"), 0)
+    numbers = (*bounds, *speeds, *general, *a, *d, *alpha, *theta, 0, 0, kind, 0)
+    return _part(CONFIGURATION, struct.pack(">12d12d5d24d4i", *numbers))
 
 
 def _part(kind: int, body: bytes) -> bytes:
