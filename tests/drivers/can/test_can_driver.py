@@ -105,14 +105,16 @@ def test_arming_enables_where_the_arm_stands_and_moves_nothing(served):
 def test_another_commander_on_the_bus_keeps_us_from_arming(served):
     bus = other_bus(served.settings)
     frame = can.Message(arbitration_id=0x155, data=bytes(8), is_extended_id=False)
-    task = bus.send_periodic(frame, 0.01)  # on a busy machine one would be too long ago
-    state = state_when(served, lambda _: served.driver.reader.foreign is not None)
+    task = bus.send_periodic(frame, 0.01)
+    driver, quiet = served.driver, 1.0  # s; on a busy machine the last one may be long ago
+    driver.settings = served.settings.model_copy(update={"foreign_quiet": quiet})
+    state = state_when(served, lambda _: driver.reader.foreign is not None)
     with pytest.raises(WriteError, match=r"another commander sent 0x155 .* two masters"):
-        served.driver.arm(state)
+        driver.arm(state)
     assert not any(served.nodes.enabled)
     task.stop()
     task.thread.join()  # it may have a frame to send yet
-    time.sleep(served.settings.foreign_quiet)
+    state_when(served, lambda _: time.monotonic() - driver.reader.foreign.seen > quiet)
     armed(served)
     bus.shutdown()
 
