@@ -210,7 +210,10 @@ class CanDriver(Driver):
     # -- writing ----------------------------------------------------------------------------------
 
     def _make_ready(self, state: RobotState) -> None:
-        """Enable the motors at the present joints. Raises WriteError, and then none is enabled."""
+        """Enable the motors at the present joints.
+
+        Raises WriteError; none is enabled then, unless another commander has the arm.
+        """
         if not self.profile.writes:
             raise WriteError(f"{self.profile.name}: this profile is read only")
         quiet = self.settings.foreign_quiet
