@@ -44,10 +44,12 @@ def ask(cell: Path, command: str) -> Any:
     if silent:
         raise RunError(silent)
     if not refused:
-        from gapbridge.bridge.cell.document import read_document  # brings yaml
-
         others = ", ".join(str(status["cell"]) for status in running())
+        if not (others or cell.exists()):
+            raise InputError(f"{cell}: file not found, expected a cell file (YAML)")
         if not others:
+            from gapbridge.bridge.cell.document import read_document  # brings yaml
+
             read_document(cell)  # raises for what is no cell
         refused = f"{cell}: found no running daemon, expected one: gapbridge run"
         refused += f" (running: {others})" if others else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -33,6 +34,13 @@ def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
+def short_folder() -> Iterator[Path]:
+    """Return a folder that can hold a user's, and that a socket: a path of at most 107 bytes."""
+    with tempfile.TemporaryDirectory() as name:
+        yield Path(name)
+
+
+@pytest.fixture
 def asked(cell: Path) -> Iterator[list[str]]:
     """Serve the cell's socket, saying that all is well; yields what was asked for."""
     heard: list[str] = []
@@ -59,15 +67,14 @@ def test_a_daemon_is_found_by_a_link_to_its_cell_and_without_the_file(
 
 @pytest.mark.parametrize("user", ["own", "another"])
 def test_a_daemon_of_a_login_is_found_without_its_environment(
-    cell: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, user: str
+    cell: Path, short_folder: Path, monkeypatch: pytest.MonkeyPatch, user: str
 ) -> None:
     """By su, sudo and cron: they said that no daemon runs. Root finds everybody's."""
     if user == "another" and os.geteuid() != 0:
         pytest.skip("only root may ask daemons of others")
-    logins = tmp_path / "user"
     number = os.geteuid() if user == "own" else STRANGER
-    (folder := logins / str(number)).mkdir(0o700, parents=True)
-    monkeypatch.setattr(runtime_module, "LOGINS", logins)
+    (folder := short_folder / str(number)).mkdir(0o700)
+    monkeypatch.setattr(runtime_module, "LOGINS", short_folder)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
     path = runtime_folder() / f"{cell_key(cell)}.sock"
     with ControlSocket(path, lambda command, _: {"ok": True, "answer": command}, SYSTEM):
@@ -80,6 +87,7 @@ def test_who_asks_for_no_daemon_is_told_which_ones_run(
     cell: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A link was set to another cell while the daemon of the one before runs."""
+    monkeypatch.setattr(control_client, "running", list)  # other tests have daemons
     with pytest.raises(InputError, match=r"expected one: gapbridge run$"):
         ask(cell, "disarm")
     monkeypatch.setattr(control_client, "running", lambda: [{"cell": "/cells/before.yaml"}])
