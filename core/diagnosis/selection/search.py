@@ -91,8 +91,10 @@ def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
         best = min([best, pruned(space, again)], key=lambda f: f.score)
     extended = [fit(space, (*best.chosen, c)) for _, c in joining(space, best.chosen, 4)]
     nearest = min([best, *extended], key=lambda f: f.score)
-    if nearest.score < best.score:
-        return exchanged(space, forward_selected(space, nearest, named_only=True))
+    if nearest.score < best.score:  # an unnamed function may let further named causes in
+        found = forward_selected(space, nearest, named_only=True)
+        # about no terms it may only be for what is not linear
+        return exchanged(space, found) if base else found
     return min([best, *joined_sets(space, best)], key=lambda f: f.score)
 
 
