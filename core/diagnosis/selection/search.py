@@ -44,29 +44,31 @@ MAX_TERMS_OF_LARGE_LOG = 40
 
 def screened_search(
     space: SampleSpace, base: Sequence[int] = (),
-    transform: Callable[[SampleSpace], SampleSpace] = lambda space: space,
+    transform: Callable[[SampleSpace], SampleSpace] = lambda space: space, exchange: bool = False,
 ) -> CandidateFit:  # fmt: skip
     """Return the best set among the candidates worth a search, in the indices of ``space``.
 
-    ``transform`` is applied to the space of these candidates (whitening by links).
+    ``transform`` is applied to the space of these candidates (whitening by links); ``exchange``:
+    see ``search``.
     """
     keep = screened(space, base)
     place = {int(c): i for i, c in enumerate(keep)}
     part_space = transform(part(space, keep))
-    best = with_fewest_families(part_space, search(part_space, [place[c] for c in base]))
+    best = with_fewest_families(part_space, search(part_space, [place[c] for c in base], exchange))
     return replace(best, chosen=tuple(int(keep[c]) for c in best.chosen))
 
 
-def search(space: SampleSpace, base: Sequence[int] = ()) -> CandidateFit:
+def search(space: SampleSpace, base: Sequence[int] = (), exchange: bool = False) -> CandidateFit:
     """Return the best set: named causes alone, unless adding an unnamed function improves it.
 
-    ``base`` is a set already found (named causes), used as a further start.
+    ``base`` is a set already found (named causes), used as a further start. ``exchange``: beside
+    an unnamed function of a large log a cause is exchanged for several, too.
 
     The catalogue is searched by itself first, because a smooth function can imitate several causes
     at once.
     """
     if len(space.y) >= LARGE_SAMPLE:
-        return _deep_search(space, base)
+        return _deep_search(space, base, exchange)
     named = improve(space, beam_search(space, named_only=True)[0], named_only=True)
     if base:
         again = improve(space, fit(space, tuple(base)), named_only=True)
@@ -78,7 +80,7 @@ def search(space: SampleSpace, base: Sequence[int] = ()) -> CandidateFit:
     return min([named, whole, better], key=lambda f: f.score)
 
 
-def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
+def _deep_search(space: SampleSpace, base: Sequence[int], exchange: bool) -> CandidateFit:
     """Return the best set of a large log, by forward selection, since many causes separate well.
 
     Terms are added one by one and dropped when later ones make them redundant; an unnamed function
@@ -94,7 +96,7 @@ def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
     if nearest.score < best.score:  # an unnamed function may let further named causes in
         found = forward_selected(space, nearest, named_only=True)
         # about no terms it may only be for what is not linear
-        return exchanged(space, found) if base else found
+        return exchanged(space, found) if exchange and base else found
     return min([best, *joined_sets(space, best)], key=lambda f: f.score)
 
 
