@@ -105,7 +105,7 @@ def exchanged(space: SampleSpace, current: CandidateFit) -> CandidateFit:
     """Return a small set after exchanging single terms for others while the score improves.
 
     What a term leaves when it is taken out may need several others: an inertia and a torque
-    constant may stand for a payload and another torque constant.
+    constant may imitate a payload and another torque constant.
     """
     for _ in range(MAX_EXCHANGED):
         better = current

@@ -153,7 +153,7 @@ def _round(
     columns += [step_columns for _, step_columns in stepping]
     space, unprojected = sample_space(state, columns, base, smooth)
     in_model = [candidate_of(state.candidates, t)[0] for t in base]
-    # of positions it took the flexibilities of an M1013 for links: 1.28 mm instead of 0.82
+    # of positions: an M1013 lost its flexibilities by it (1.28 mm on judged poses, not 0.82)
     exchange = state.observation.channel != "position"
     best = one_delay(space, screened_search(space, in_model, exchange=exchange))
     if not first and not state.kept.all():

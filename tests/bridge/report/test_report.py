@@ -110,12 +110,12 @@ def test_what_fits_and_was_withdrawn_is_named_where_there_is_no_cause():
     why = Withdrawal(Check.SEPARATED, "payload")
     fits = Considered("ft_bias", 0.99, 1.0, Outcome.WITHDRAWN, withdrawal=why)
     no = Considered("ft_gain", 0.0, 0.0, Outcome.NOT_NEEDED)
-    (_, told, _) = sentences(replace(channel, considered=(no,)))
-    assert "its cause is not in the catalogue" in told
-    (_, told, _) = sentences(replace(channel, considered=(fits, no)))
-    assert effect_title("ft_bias") in told
-    assert effect_title("ft_gain") not in told
-    assert "not in the catalogue" not in told
+    (_, sentence, _) = sentences(replace(channel, considered=(no,)))
+    assert "its cause is not in the catalogue" in sentence
+    (_, sentence, _) = sentences(replace(channel, considered=(fits, no)))
+    assert effect_title("ft_bias") in sentence
+    assert effect_title("ft_gain") not in sentence
+    assert "not in the catalogue" not in sentence
 
 
 def test_what_a_quantity_predicts_is_not_called_noise():
